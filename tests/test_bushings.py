@@ -108,6 +108,20 @@ def test_energy_and_momentum_of_two_parts():
         assert np.abs(after - before).max() < 1e-12 * np.abs(before).max()
 
 
+def test_values_of_worlds_whose_first_ones_cancel():
+    """10 + 20 = 30 about the axes: one of its springs has nothing to do until a world has other values."""
+    b, _ = mounted(stiffness=(1e4, 1e4, 1e4, 10, 20, 30), damping=(0, 0, 0, 1, 2, 3))
+    model = b.finalize(device="cpu", worlds=2)
+    model.set_parameter("mount.stiffness", [(1e4, 1e4, 1e4, 10, 20, 30), (1e4, 1e4, 1e4, 50, 50, 50)])
+    model.set_parameter("mount.damping", (0, 0, 0, 1, 1, 1))
+    for world, values in enumerate(((10, 20, 30), (50, 50, 50))):
+        expected = np.sort([1e4, 1e4, 1e4, *(600.0 * value for value in values)])
+        found = wf.modes(model, count=6, world=world)
+        assert found.eigenvalues == pytest.approx(expected, rel=1e-6)
+    J, w = 1.0 / 600.0, np.sqrt(3e4)  # dampers of 1 about all axes
+    assert found.damping_ratios == pytest.approx([0, 0, 0, *3 * [1.0 / (2.0 * w * J)]], abs=1e-6)
+
+
 def test_the_largest_turn():
     b, part = mounted(stiffness=(1e4, 1e4, 1e4, 0.01, 0.01, 0.01))
     b.set_initial(part, angular_velocity=(0, 0, 30.0))

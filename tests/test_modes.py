@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 import warp as wp
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
@@ -136,6 +137,22 @@ def test_spinning_string_has_its_prestress():
     assert modes.rigid_body_modes == 1  # rolls about itself
     assert modes.eigenvalues[1:3] == pytest.approx(spin**2, rel=1e-5)
     assert modes.eigenvalues[3:5] == pytest.approx(6.0 * spin**2, rel=5e-3)
+
+
+@pytest.mark.parametrize("density", [1.0, 1e-3, 1e-5])
+def test_a_light_beam_carries_a_heavy_part(density):
+    """Both planes by the flexibility of the tip, where the beam has up to 1e-11 of the mass."""
+    b, body = beam(4, section=(WIDTH, WIDTH), law=wf.SVK(E=E, nu=0.0, density=density))
+    b.clamp(body.start, slots="position+section")
+    part = b.add_rigid(wf.Box((1.1, 0, 0), (0.2, 0.2, 0.2)), mass=10.0)
+    b.weld(body.end, part)
+    with pytest.warns(wf.MeshWarning, match="density of SVK"):
+        model = b.finalize(device="cpu")
+    K = E * WIDTH**4 / 12.0 * np.array([(12.0, -6.0), (-6.0, 4.0)])
+    M = np.array([(10.0, 1.0), (1.0, part.inertia[1, 1] + 0.1)])
+    squares = scipy.linalg.eigvalsh(K, M)
+    found = wf.modes(model, count=5).eigenvalues
+    assert found[[0, 1, 3, 4]] == pytest.approx(np.repeat(squares, 2), rel=2e-3)
 
 
 def test_hinged_chain_hangs_on_its_joint_forces():

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipk
 
 import warpfea as wf
+from warpfea.model.assembly import facet_areas, facet_positions, facet_tables
 
 TIGHT = {"solver": wf.NewtonPCG(tol=1e-12), "constraint_tol": 1e-12}
 INERTIA = np.array([1.0, 2.0, 3.0])
@@ -427,6 +428,26 @@ def test_observed_axes_and_centre_are_those_of_the_pose() -> None:
     spin = rate @ A.T
     np.testing.assert_allclose([spin[2, 1], spin[0, 2], spin[1, 0]], sim.angular_velocity(part)[0], atol=1e-12)
     np.testing.assert_allclose(row[21:].reshape(-1, 3), sim.velocities(part)[0], atol=1e-13)
+
+
+def test_sides_have_names() -> None:
+    """Those of a box and a cylinder along their own axes; loads on them are those of the true faces."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    turn = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix()
+    box = b.add_rigid(wf.Box((1, 2, 3), (0.2, 0.3, 0.5), axes=turn.T), mass=1.0)
+    rod = b.add_rigid(wf.Cylinder((0, 0, 0), (0, 2, 0), 0.1), mass=1.0)
+    sides = {"x-": -turn[:, 0], "x+": turn[:, 0], "y-": -turn[:, 1], "y+": turn[:, 1], "z-": -turn[:, 2]}
+    for name, normal in sides.items():
+        x = facet_positions(box, facet_tables(box.surface(name)))
+        assert (x - (1, 2, 3)) @ normal == pytest.approx(0.5 * (0.2, 0.3, 0.5)["xyz".index(name[0])])
+    for name, area in (("bottom", np.pi * 0.01), ("top", np.pi * 0.01), ("side", 0.4 * np.pi)):
+        surface = rod.surface(name)
+        assert facet_areas(rod, facet_tables(surface)).sum() == pytest.approx(area, rel=5e-3)
+    assert facet_positions(rod, facet_tables(rod.surface("top")))[..., 1] == pytest.approx(2.0)
+    b.add_traction(box.surface("z+"), (0.0, 0.0, 100.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    sim.step()
+    assert sim.velocities(box)[0].mean(axis=0)[2] == pytest.approx(100.0 * 0.06 * 1e-3)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from ..materials import SVK, Material
 from ..mesh import Mesh
 from ..mesh.cells import TET_FACES
 from ..model.rigid import RigidBody, surface_moments, volume_moments
-from ..model.shapes import Capsule, Cylinder, HalfSpace, Shape, Sphere, flat_ends
+from ..model.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere, flat_ends
 from ..model.triangle_mesh import TriMesh
 from .checks import vector
 
@@ -153,7 +153,7 @@ def _surface(what: str, shape: Any) -> tuple[np.ndarray, np.ndarray, dict[str, n
         )
     if isinstance(shape, Shape):
         points, triangles = shape.mesh()
-        return points, triangles, {}
+        return points, triangles, _named_sides(shape, points[triangles])
     if shape.cell_type not in ("tetra", "tetra10", "hexahedron"):
         raise ModelError(
             f"{what}: {shape.label} has {shape.cell_type} cells; expected a volume, or a closed wf.TriMesh"
@@ -168,6 +168,17 @@ def _surface(what: str, shape: Any) -> tuple[np.ndarray, np.ndarray, dict[str, n
         own = [row[tuple(face)] for face in members.tolist() if tuple(face) in row]
         sets[label] = (np.array(own, dtype=np.int64)[:, None] * len(cut) + np.arange(len(cut))).ravel()
     return shape.points, triangles, sets
+
+
+def _named_sides(shape: Shape, x: np.ndarray) -> dict[str, np.ndarray]:
+    """Triangles of the sides of a shape that is drawn by x (n, 3, 3), along its own axes, named as those of meshes."""
+    if isinstance(shape, Box):
+        return {label: np.array([2 * k, 2 * k + 1]) for k, label in enumerate(("z-", "z+", "y-", "y+", "x-", "x+"))}
+    if isinstance(shape, Cylinder):
+        flat, far = flat_ends(shape, x), (x[:, 0] - shape.frame()[0]) @ shape.frame()[1][:, 2] > 0.0
+        return {name: np.flatnonzero(part)
+                for name, part in (("bottom", flat & ~far), ("top", flat & far), ("side", ~flat))}  # fmt: skip
+    return {} if isinstance(shape, TriMesh) else {"surface": np.arange(len(x))}
 
 
 def _cone_mesh(

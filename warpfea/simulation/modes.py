@@ -48,6 +48,8 @@ MAX_RESTARTS = 300
 MIN_LOAD_RATIO = 1e-4
 """Critical load of the reversed load over the smallest that counts: beyond, the material is far from linear. A
 bound between the round-off of a load that has none and ratios for which linear stresses stand."""
+HIDDEN = 1e-11
+"""Round-off of the largest eigenvalue over those wanted, beyond which these are sought by themselves: a bound."""
 ZERO = 1e-12
 """phi.K phi over phi.diag(K) phi below which it is round-off: a rigid-body mode. A bound: sums in float64
 leave 1e-15, the softest bending mode of a beam of n elements is about 1 / n^4."""
@@ -372,7 +374,7 @@ def _vibrations(
     n = len(system.index)
     if n <= MAX_DENSE or 4 * count > n:
         Z = system.null_space()
-        values, vectors = _dense_vibrations(Z.T @ (system.K @ Z), Z.T @ (M @ Z))
+        values, vectors = _dense_vibrations(Z.T @ (system.K @ Z), Z.T @ (M @ Z), count)
         near = np.argsort(np.abs(values - (shift or 0.0)) if shift is not None else values)[:count]
         near = near[np.argsort(values[near])]
         return values[near], Z @ vectors[:, near]
@@ -385,8 +387,9 @@ def _vibrations(
     return values[order], vectors[:, order]
 
 
-def _dense_vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All eigenvalues and vectors; directions without mass follow the others at rest."""
+def _dense_vibrations(K: np.ndarray, M: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """All eigenvalues and vectors; directions without mass follow the others at rest. The largest of light elements
+    beside heavy parts hide the `count` lowest in their round-off: these are those of M phi = mu (K + shift M) phi."""
     mass, axes = np.linalg.eigh(M)
     heavy = mass > 1e-13 * mass[-1]
     T = axes[:, heavy] / np.sqrt(mass[heavy])
@@ -394,7 +397,15 @@ def _dense_vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndar
         V = axes[:, ~heavy]
         T = T - V @ np.linalg.lstsq(V.T @ K @ V, V.T @ K @ T, rcond=None)[0]
     values, y = np.linalg.eigh(T.T @ K @ T)
-    return values, T @ y
+    vectors, count = T @ y, min(count, len(values))
+    if np.finfo(float).eps * values[-1] > HIDDEN * abs(values[:count]).max():
+        shift = RELATIVE_SHIFT * float(np.median(np.diag(K)[np.diag(M) > 0.0] / np.diag(M)[np.diag(M) > 0.0]))
+        try:
+            mu, low = scipy.linalg.eigh(M, K + shift * M, subset_by_index=[len(K) - count, len(K) - 1])
+        except np.linalg.LinAlgError:  # an unstable state
+            return values, vectors
+        values[:count], vectors[:, :count] = 1.0 / mu[::-1] - shift, low[:, ::-1] / np.sqrt(mu[::-1])
+    return values, vectors
 
 
 def _modal_damping(model: Model, state: State, world: int, system: LinearSystem, phi: np.ndarray) -> np.ndarray:
