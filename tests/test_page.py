@@ -112,6 +112,11 @@ def test_menus_change_the_colors(page):
     page.page.locator("#high").press("Enter")
     page.page.locator("#high").blur()
     assert (np.abs(picture(page) - pictures[0]).max(axis=2) > 30).sum() > 500
+    page.page.fill("#low", "1.999e6")
+    page.page.locator("#low").press("Enter")
+    page.page.locator("#low").blur()
+    ticks = page("Array.from(document.querySelectorAll('#ticks li'), (tick) => tick.textContent)")
+    assert (ticks[0], ticks[4], len(set(ticks))) == ("2", "1.999", 5)
     page.page.click("#auto")
     assert (picture(page) == pictures[0]).all()
 

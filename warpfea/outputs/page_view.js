@@ -200,21 +200,17 @@ class View {
     this.range = range ?? [this.field?.low ?? 0, this.field?.high ?? 0];
     $("legend").hidden = !this.field;
     for (const id of ["low", "high", "auto", "map"]) $(id).disabled = !this.field;
-    if (!this.field) return;
-    $("low").value = digits(this.range[0], 6);
-    $("high").value = digits(this.range[1], 6);
-    this.setMap();
+    if (this.field) this.setMap();
   }
 
   readRange() {
     const range = [+$("low").value, +$("high").value];
     if (range.every(Number.isFinite) && range[0] < range[1]) this.range = range;
-    $("low").value = digits(this.range[0], 6);
-    $("high").value = digits(this.range[1], 6);
     this.setMap();
   }
 
   setMap() {
+    ["low", "high"].forEach((id, k) => { $(id).value = digits(this.range[k], 6); });
     const table = this.data.maps[$("map").value].split(" "), colors = new Uint8Array(768);
     for (let k = 0; k < 256; k++) {
       const x = k / 255 * (table.length - 1), i = Math.min(Math.floor(x), table.length - 2);
@@ -230,10 +226,13 @@ class View {
       pen.fillStyle = `rgb(${colors[3 * k]},${colors[3 * k + 1]},${colors[3 * k + 2]})`;
       pen.fillRect(0, 255 - k, 1, 1);
     }
-    const [low, high] = this.range, [factor, units] = scaled(this.field.units, Math.max(Math.abs(low), Math.abs(high)));
+    const [low, high] = this.range, largest = Math.max(Math.abs(low), Math.abs(high));
+    const [factor, units] = scaled(this.field.units, largest);
+    const wanted = 1 + Math.ceil(Math.log10(4 * largest / (high - low))); // for ticks to differ
+    const places = high > low ? Math.min(Math.max(3, wanted), 9) : 3;
     $("legend-title").textContent = this.field.title + (units ? ` (${units})` : "");
     $("ticks").replaceChildren();
-    for (let k = high > low ? 4 : 0; k >= 0; k--) element("li", digits((low + (high - low) * k / 4) / factor, 3), $("ticks"));
+    for (let k = high > low ? 4 : 0; k >= 0; k--) element("li", digits((low + (high - low) * k / 4) / factor, places), $("ticks"));
   }
 
   // ---- time
