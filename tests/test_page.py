@@ -188,6 +188,30 @@ def test_playing_and_turning(page):
     distance = page("page.view.camera.distance")
     page.page.mouse.wheel(0, 200)
     page.page.wait_for_function(f"page.view.camera.distance > {1.2 * distance}")
+    mark = page("page.view.camera.target")
+    seen = "(x) => page.view.camera.project(x, page.view.aspect())"
+    before = np.array(page(seen, mark))[:2]
+    page.page.keyboard.down("Shift")
+    page.page.mouse.move(box["x"] + 300, box["y"] + 200)
+    page.page.mouse.down()
+    page.page.mouse.move(box["x"] + 360, box["y"] + 220)
+    page.page.mouse.up()
+    page.page.keyboard.up("Shift")
+    moved = (np.array(page(seen, mark))[:2] - before) / 2 * (box["width"], box["height"])
+    assert moved == pytest.approx((60, -20), abs=1.0)  # what is held follows the pointer
+    rates = page("""(() => {
+      const view = page.view, frames = [], out = [], own = window.requestAnimationFrame;
+      window.requestAnimationFrame = (frame) => frames.push(frame);
+      for (const speed of [0.5, 2]) {
+        [document.getElementById("speed").value, view.time] = [speed, 0];
+        view.play();
+        frames.pop()(performance.now() + 200);
+        view.pause();
+        out.push(view.seconds());
+      }
+      [document.getElementById("speed").value, window.requestAnimationFrame] = [1, own];
+      return out; })()""")
+    assert rates[1] == pytest.approx(4.0 * rates[0], rel=0.1)
     assert not page.errors
 
 
@@ -329,6 +353,8 @@ def test_colliders_marks_and_the_runs_warnings_are_drawn(tmp_path, browser):
     tab = Tab(browser, path)
     tab("page.view.draw()")
     assert tab.page.locator("#notes").inner_text().startswith("the tolerance was not reached in")
+    titles = tab("page.data.plots.map((plot) => plot.title)")
+    assert [title.partition(" ")[0] for title in titles] == ["joint", "contact", "contact", "energy"], titles
     kinds = ("support", "joint", "load", "spring")
     grid = {kind: marked(tab, kind) for kind in kinds}
     assert min(grid.values()) > 15, grid

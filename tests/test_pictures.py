@@ -10,6 +10,7 @@ import pytest
 from stub_simulation import FAR, StubSim, drive, left_over, tet_box
 
 from warpfea.base.errors import ModelError, OutputError
+from warpfea.outputs.animation import to_palette
 from warpfea.outputs.colormap import map_colors, to_linear
 from warpfea.outputs.normals import smooth_corners
 from warpfea.outputs.raycaster import Camera, Renderer, nice_number
@@ -86,6 +87,23 @@ def test_png_shows_the_scene(tmp_path):
     other = np.asarray(Image.open(early)).astype(int)
     assert np.abs(other - image).max() > 60
     assert (np.ptp(other, axis=2) > 60).sum() == 0  # grey body
+
+
+def test_frames_of_a_gif_have_no_bands():
+    """Means over squares of a slope miss it by one value everywhere; the nearest of colours that are 8 apart go up and
+    down by 6."""
+    from PIL import Image
+
+    slope = np.repeat(np.linspace(64, 128, 512)[None, :, None], 64, axis=0).repeat(3, axis=2).round().astype(np.uint8)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.repeat(np.arange(0, 256, 8), 3).tolist())
+    nearest = Image.fromarray(slope).quantize(palette=palette, dither=Image.Dither.NONE)
+    errors = []
+    for picture in (to_palette(slope, palette), nearest):
+        off = np.asarray(picture.convert("RGB")).astype(float) - slope
+        errors.append(np.ptp(off.reshape(8, 8, 64, 8, 3).mean(axis=(1, 3))))
+    assert errors[0] < 0.5
+    assert errors[1] > 5.0
 
 
 def test_gif_frames_differ(tmp_path):

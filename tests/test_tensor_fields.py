@@ -57,6 +57,12 @@ def test_uniform_state(name):
             material=LAWS[name],
             name=element,
         )
+    if name == "SVK":  # whose elements have other laws elsewhere
+        options = {"material": LAWS[name], "integration": "full"}
+        b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1), element="H3843"), material=LAWS[name], name="H3843")
+        section = wf.Rectangle(0.1, 0.1)
+        b.add_beam([(0, 0, 0), (1, 0, 0)], elements=2, section=section, normal=(0, 0, 1), name="3243", **options)
+        b.add_shell(wf.mesh.grid((1, 0.2), cells=(2, 1)), thickness=0.1, name="3443", **options)
     model = b.finalize(device="cpu")
     results = Results(model, move(model, GRADIENT))
     F, J = GRADIENT, np.linalg.det(GRADIENT)
