@@ -48,7 +48,7 @@ def test_a_speck_far_from_its_place_is_refused_for_round_off():
                   angular_velocity=(0, 0, 1))  # fmt: skip
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, integrator="energy_momentum")
     np.testing.assert_allclose(sim.angular_velocity("speck"), [[0, 0, 1]])
-    with pytest.raises(wf.ConstraintError, match="round-off of positions .* m from the reference is larger"):
+    with pytest.raises(wf.ConstraintError, match=r"round-off of positions .* m from the reference is larger"):
         sim.run(2.0)
     assert sim.pose("speck")[0][0, 2] < -1.0
 

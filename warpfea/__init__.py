@@ -61,13 +61,13 @@ from .time_laws import Control, Rotation  # noqa: E402
 __all__ = [
     "GROUND", "PD", "SVK", "Adjoint", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint",
     "CheckpointError", "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet",
-    "EnergyMomentum", "Error", "Friction", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi", "Joint",
-    "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning",
-    "Modes", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter",
-    "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",
-    "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter",
-    "VTUWriter", "__version__", "buckling", "fit", "loss", "mesh", "modes", "read_results", "scene", "solve_static",
-    "spline", "study", "sweep", "torch",
+    "EnergyMomentum", "Error", "Friction", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi",
+    "Joint", "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError",
+    "ModelWarning", "Modes", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError",
+    "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere",
+    "StabilityError", "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh",
+    "Tube", "USDWriter", "VTUWriter", "__version__", "buckling", "fit", "loss", "mesh", "modes", "read_results",
+    "scene", "solve_static", "spline", "study", "sweep", "torch",
 ]  # fmt: skip
 
 

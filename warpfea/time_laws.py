@@ -1,5 +1,6 @@
 """Time laws: a constant, samples (times, values), a `wp.func` of t, or a `Control`."""
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -158,14 +159,14 @@ def time_law(value: Any, what: str, *, scalar: bool = False, key: str | None = N
     """
     if key is not None and not (isinstance(key, str) and key):
         raise ModelError(f"{what}: name = {key!r} must be a text")
-    names = {"name": what, "key": key or ""}
+    named = functools.partial(TimeLaw, scalar=scalar, name=what, key=key or "")
     if isinstance(value, Control):
         if value.size != (1 if scalar else 3):
             needed = SIZE_NAMES[1 if scalar else 3]
             raise ModelError(f"{what}: control {value.name!r} has size {value.size}, but {needed} is to be driven")
-        return TimeLaw(np.zeros(0), np.zeros((0, 3)), scalar=scalar, control=value, **names)
+        return named(np.zeros(0), np.zeros((0, 3)), control=value)
     if isinstance(value, wp.Function):
-        return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar, **names)
+        return named(np.zeros(0), np.zeros((0, 3)), function=value)
     if callable(value):
         name = getattr(value, "__name__", type(value).__name__).replace("<lambda>", "a lambda")
         raise ModelError(
@@ -177,4 +178,4 @@ def time_law(value: Any, what: str, *, scalar: bool = False, key: str | None = N
     times, values = parse(value, what, () if scalar else (3,))
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise ModelError(f"{what}: {value!r} holds a value that is not finite")
-    return TimeLaw(times, _as_vectors(values, scalar), None, scalar, **names)
+    return named(times, _as_vectors(values, scalar))

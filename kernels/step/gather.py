@@ -107,6 +107,17 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
             return balance.g[world, slot]
 
     @wp.func
+    def pool_magnitude(topo: Topology, balance: Balance, world: int, slot: int, total: vec3) -> vec3:
+        """Scale of the pooled forces on a slot: opposing contact forces on a body cancel, each sets a scale by itself."""
+        largest = vec3(wp.abs(total[0]), wp.abs(total[1]), wp.abs(total[2]))
+        if wp.static(not traits.unilateral):  # so do a joint's friction and its constraint force
+            for j in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
+                one = balance.pool_force[world, topo.pool_entry[j]]
+                for k in range(3):
+                    largest[k] = wp.max(largest[k], wp.abs(one[k]))
+        return largest
+
+    @wp.func
     def squared_length(a: vec3) -> f64:
         """a.a in float64, for forces whose square overflows float32."""
         s = f64(0.0)
@@ -159,15 +170,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
             descent += vec3(constraint_force[2])
             for k in range(3):
                 magnitude[k] = magnitude[k] + T(wp.abs(constraint_force[0][k]))
-        if wp.static(traits.pooled):  # opposing contact forces on a body cancel: each sets a scale by itself
-            largest = vec3(wp.abs(of_pool[0]), wp.abs(of_pool[1]), wp.abs(of_pool[2]))
-            if wp.static(not traits.unilateral):  # so do a joint's friction and what it holds
-                for entry in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
-                    one = balance.pool_force[world, topo.pool_entry[entry]]
-                    for k in range(3):
-                        largest[k] = wp.max(largest[k], wp.abs(one[k]))
-            for k in range(3):
-                magnitude[k] = magnitude[k] + largest[k]
+        if wp.static(traits.pooled):
+            magnitude = magnitude + pool_magnitude(topo, balance, world, slot, of_pool)
         balance.inertia[world, slot] = a
         balance.internal[world, slot] = f
         balance.g[world, slot] = residual_force

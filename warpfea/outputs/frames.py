@@ -34,7 +34,7 @@ def field_label(sim: Any, name: str) -> tuple[str, str]:
 
 def field_names(fields: Any, color: Any = None) -> list[str]:
     """Names of the fields of a writer, each once, the shown one too. ModelError for anything else."""
-    names = list(fields) if isinstance(fields, Iterable) and not isinstance(fields, str) else [None]
+    names: list[Any] = list(fields) if isinstance(fields, Iterable) and not isinstance(fields, str) else [None]
     if not all(isinstance(name, str) for name in names):
         raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {fields!r}")
     if not isinstance(color, (str, type(None))):

@@ -335,11 +335,11 @@ def constraint_rates(
 
     u, v: (slots, 3); laws: (3 or 4, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
     """
-    moved, speed = (vectors_of(tables, field) for field in (u, v))
+    moved, speed = (term_vectors(tables, field) for field in (u, v))
     return rates_of_vectors(tables, moved, speed, right_sides(tables, laws))
 
 
-def vectors_of(tables: Any, field: np.ndarray) -> np.ndarray:
+def term_vectors(tables: Any, field: np.ndarray) -> np.ndarray:
     """Vectors (3 rows, 3) of the rows' terms of a field (slots, 3)."""
     out = np.zeros((3 * tables.count, 3))
     np.add.at(out, tables.term_host, tables.weight_host[:, None] * field[tables.slot_host])

@@ -18,7 +18,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.worlds import set_rows
 from ..terms.protocols import Constrained, Differentiable
-from .consistent_initial_conditions import rates_of_vectors, right_sides, vectors_of
+from .consistent_initial_conditions import rates_of_vectors, right_sides, term_vectors
 
 if TYPE_CHECKING:
     import warp as wp
@@ -61,7 +61,7 @@ class RowsOfWorld:
 
     def __init__(self, tables: Any, fields: list[np.ndarray], laws: np.ndarray, s: float) -> None:
         self.tables, self.laws, self.s = tables, laws, s
-        self.vectors = [vectors_of(tables, field) for field in fields]
+        self.vectors = [term_vectors(tables, field) for field in fields]
         self.bars = [np.zeros_like(vector) for vector in self.vectors]
         self.target_bar = np.zeros(tables.count)
 
@@ -80,7 +80,7 @@ class RowsOfWorld:
 
     def solve_work(self, y: np.ndarray, z: np.ndarray, x: np.ndarray, m: np.ndarray, right: Any) -> None:
         """Add -y.J^T m - z.J x + z.right of a solve; right(u, v, v1, w, targets)."""
-        Y, X = (vectors_of(self.tables, field) for field in (y, x))
+        Y, X = (term_vectors(self.tables, field) for field in (y, x))
 
         def work(*given: Any) -> np.ndarray:
             *vectors, shift = given
@@ -142,7 +142,7 @@ def step_back_to_initial(
     late = 1.0 / 6.0 - 1.0 / (s.integrator.parameter + 1.0) ** 2 - 0.5 * early
     laws = start.law_derivatives(flags, h)
     corrected, zero = before.copy(), np.zeros((count, 3))
-    x, rows, fixed = np.zeros_like(u), {}, m.slot_table.free == 0.0
+    x, rows, prescribed = np.zeros_like(u), {}, m.slot_table.free == 0.0
     first, jerk = np.zeros_like(u), np.zeros_like(u)
     jerk_bars = np.zeros_like(u)
     multipliers = {}
@@ -150,7 +150,7 @@ def step_back_to_initial(
         start.begin_world(world)
         own = laws[:, world]
         J, rate, _ = start.constraint_rows(u[world], before[world], own)
-        jump = start.prescribed_rates(own)[0] - np.where(fixed, before[world], 0.0)
+        jump = start.prescribed_rates(own)[0] - np.where(prescribed, before[world], 0.0)
         first[world], m1 = start.solve_saddle_point(zero, jump, J, -rate)
         corrected[world] += first[world]
         multipliers[world] = J, m1
@@ -207,7 +207,7 @@ def step_back_to_initial(
             r.solve_work(y, z, first[world], m1, r.velocity_side)
             q_bar[world] += r.slots(0, count)
             v_bar[world] = target + r.slots(1, count)
-        v_bar[world] += np.where(fixed, impulse - target, 0.0)
+        v_bar[world] += np.where(prescribed, impulse - target, 0.0)
     for array, values in ((solver.q_bar, q_bar), (solver.v_bar, v_bar)):
         set_rows(array, flags, values[flags])
     _add_inertia(s, at, flags, h, gradients, ((first, first_bars), (jerk, jerk_bars)))

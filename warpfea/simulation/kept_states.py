@@ -141,7 +141,9 @@ class KeptStates(list[dict[str, wp.array]]):
     def _read(self, i: int) -> None:
         specs, device = self.sim.state.specs, self.sim.model.device
         with np.load(self._file(i)) as data:
-            state = {name: wp.array(data[name], dtype=specs[name].dtype, device=device) for name in self.names}
+            state: dict[str, wp.array] = {
+                name: wp.array(data[name], dtype=specs[name].dtype, device=device) for name in self.names
+            }
         self._bring_back(i, state)
 
     def _compute(self, i: int) -> None:

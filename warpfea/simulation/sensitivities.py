@@ -30,10 +30,8 @@ class Forward:
             raise ModelError("Adjoint.forward: 'generalized_alpha' has no sensitivities of its initial accelerations")
         own = Differentiable.add_history_change
         for term in self.model.terms.having(Differentiable):
-            past = overrides(term, Differentiable.add_history_gradient) or overrides(
-                term, Differentiable.linearise_adjoint
-            )
-            if past and not overrides(term, own):
+            backward = (Differentiable.add_history_gradient, Differentiable.linearise_adjoint)
+            if any(overrides(term, method) for method in backward) and not overrides(term, own):
                 raise ModelError(f"Adjoint.forward: {term.name!r} has no sensitivities of its histories")
         self.solver.prepare_forward()
         self.gradients: dict[str, list[Any]] = {

@@ -118,7 +118,7 @@ class Tape:
                 if divided.any():
                     self._take_again(divided, running, controls)
                 else:
-                    self._keep(running, controls)
+                    self._add_part(running, controls)
                 self.ends.append(len(self.kept) - 1)
                 self.kept.end_step()
                 if self.budget is not None:
@@ -134,8 +134,8 @@ class Tape:
                 self.kept[-1] = self._snapshot()
                 self.restarts[len(self.kept) - 1] = flags, before
 
-    def _keep(self, chosen: np.ndarray, controls: dict[str, wp.array]) -> None:
-        """Keep a part of a step that the chosen worlds have taken."""
+    def _add_part(self, chosen: np.ndarray, controls: dict[str, wp.array]) -> None:
+        """Add a part of a step that the chosen worlds have taken."""
         status = np.where(chosen, STATUS["running"], STATUS["frozen"]).astype(np.int32)
         self.kept[-1] |= controls  # for the part
         self.kept[-1]["dt"] = wp.clone(self.sim.stepper.work.step.h)
@@ -152,7 +152,7 @@ class Tape:
         s.newton.invalidate(flags)
         others = running & ~divided
         if others.any():
-            self._keep(others, controls)
+            self._add_part(others, controls)
         status = state.status.numpy().copy()
         state.status.assign(np.where(divided, status, STATUS["frozen"]).astype(np.int32))
 
@@ -160,7 +160,7 @@ class Tape:
             s.take_attempt()
             accepted = s.work.step.accepted.numpy() != 0
             if accepted.any():
-                self._keep(accepted, controls)
+                self._add_part(accepted, controls)
 
         s.launch_step(attempt)
         state.status.assign(status)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,11 +10,9 @@ import warpfea as wf
 
 from ..base.console import quiet_warp
 from ..base.errors import ConvergenceError, ModelError
+from .candidates import Candidates
 from .measures import COMPONENTS
 from .worker import Group
-
-if TYPE_CHECKING:
-    from .fitting import Candidates
 
 __all__ = ["DifferentiableCandidate"]
 
@@ -76,9 +73,8 @@ class DifferentiableCandidate:
             return self._residuals
         self.refused, parts = False, []
         for text, curve in self.candidates.curves.items():
-            series = getattr(self.tape.probe(curve.name), curve.quantity).numpy()[
-                :, :, COMPONENTS.index(curve.component)
-            ]
+            values = getattr(self.tape.probe(curve.name), curve.quantity).numpy()
+            series = values[:, :, COMPONENTS.index(curve.component)]
             parts.append(self.candidates.difference(text, self.times, series)[0])
         self._residuals = np.concatenate(parts)
         self.candidates.count(self._residuals[None])

@@ -41,7 +41,8 @@ __all__ = ["Constraints"]
 
 CHAIN_SHARE = 0.01
 """Share of kappa in the least penalty over the stiffness of a chain's stiffest row. With a tenth of it a link that
-carries 1e9 times its mass takes 60 % more iterations, with ten times 20 % less. In float32 no value carries more than a hundred times."""
+carries 1e9 times its mass takes 60 % more iterations, with ten times 20 % less. In float32 no value carries more than
+a hundred times."""
 MAX_THREAD_ROWS = 16
 """Maximum rows of a cluster whose matrix one thread inverts; larger ones take a launch per pivot."""
 
