@@ -108,7 +108,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
 
     @wp.func
     def pool_magnitude(topo: Topology, balance: Balance, world: int, slot: int, total: vec3) -> vec3:
-        """Scale of the pooled forces on a slot: opposing contact forces on a body cancel, each sets a scale by itself."""
+        """Scale of pooled forces: opposing contact forces on a body cancel, each sets a scale by itself."""
         largest = vec3(wp.abs(total[0]), wp.abs(total[1]), wp.abs(total[2]))
         if wp.static(not traits.unilateral):  # so do a joint's friction and its constraint force
             for j in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
