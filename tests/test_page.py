@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -375,6 +376,22 @@ def test_colliders_marks_and_the_runs_warnings_are_drawn(tmp_path, browser):
     assert max(marked(tab, kind) for kind in kinds) == 0
     tab.page.locator("#picture").press("m")
     tab.page.select_option("#world", "1")  # one world, larger
+    tab("page.view.time = page.data.times.length - 1; page.view.draw()")
+    x, y = tab("""(() => { const v = page.view, w = document.getElementById("stage");
+      const s = v.shown().find((shown) => shown.name === "bar");
+      for (let p = 0; p < s.count; p++) {
+        const [x, y] = v.camera.project(Array.from(s.points.subarray(3 * p, 3 * p + 3)), v.aspect());
+        const at = [(x + 1) / 2 * w.clientWidth, (1 - y) / 2 * w.clientHeight], hit = v.pick(...at);
+        if (hit && hit.surface === s && hit.point === p) return at;
+      } })()""")
+    tab.page.locator("#picture").hover(position={"x": x, "y": y})
+    tip = tab("document.getElementById('tip').innerText")
+    told = re.search(r"bar, world 2, node (\d+)\s*\((.*)\) m", tip)
+    assert told, tip
+    here = [float(number) for number in told[2].split(",")]
+    assert here == pytest.approx(sim.positions(bar)[2, int(told[1])], abs=1e-4)
+    tab.page.mouse.move(0, 0)
+    tab("page.view.time = 0")
     assert min(marked(tab, kind) for kind in kinds) > 15
     tab(f"{{ {alone}.filter((s) => s.world === 1); page.view.draw(); }}")
     one = np.abs(picture(tab) - empty).max(axis=2) > 12
