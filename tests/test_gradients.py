@@ -358,9 +358,21 @@ def test_an_unsymmetric_term_is_solved_with_its_transpose():
     check_gravity(m, wf.Simulation(m, dt=2e-3, solver=SOLVER), rows, 10)
 
 
-def bar(change=lambda b, box: None, law=LAW):
+def test_density_under_gravity_over_time():
+    """Statics: the deflection, proportional to the load, depends on density / E alone."""
+
+    def hang(b, box):
+        b.clamp(box.nodes("x-"))
+
+    m = bar(hang, law=wf.SVK(E=1e9, nu=0.3, density=1000.0), gravity=([0, 1], [(0, 0, 0), (0, 0, -0.1)]))
+    tape = wf.Adjoint(wf.solve_static(m, load_steps=2, tol=1e-12), ["box.E", "box.density"])
+    g = tape.backward(wf.loss.sum_of_squares(tape.probe("tip"), np.full((1, 3), TARGET)))
+    assert g["box.density"].numpy() * 1000.0 == pytest.approx(-g["box.E"].numpy() * 1e9, rel=1e-6)
+
+
+def bar(change=lambda b, box: None, law=LAW, gravity=(0, 0, -9.81)):
     """A model of one bar of T4."""
-    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    b = wf.ModelBuilder(gravity=gravity)
     box = b.add_solid(wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"), material=law, name="box")
     change(b, box)
     b.add_probe("tip", box.surface("x+"))
@@ -398,8 +410,20 @@ def test_misuse_is_refused():
     with pytest.raises(wf.ModelError, match="no step"):
         tape.backward()
     tape.run(2)
+    with pytest.raises(wf.ModelError, match="no probe was taken"):
+        tape.backward()
+    loss = wf.loss.sum_of_squares(tape.probe("tip"), np.zeros((2, 3)))
+    tape.run(1)
+    with pytest.raises(wf.ModelError, match="no probe was taken since the last step"):
+        tape.backward(loss)
+    tape.probe("tip")
+    with pytest.raises(wf.ModelError, match="not of this tape's probes"):
+        tape.backward(loss)
+    sim.state.velocity.fill_(0.1)
+    with pytest.raises(wf.ModelError, match="the state was set"):
+        tape.run(1)
     with pytest.raises(wf.ModelError, match="shape"):
-        wf.loss.sum_of_squares(tape.probe("tip"), np.zeros((3, 3)))
+        wf.loss.sum_of_squares(tape.probe("tip"), np.zeros((2, 3)))
     with pytest.raises(wf.ModelError, match="there are: 'tip'"):
         tape.probe("tap")
     with pytest.raises(wf.CapacityError, match=r"3 steps of .* of 1.0 kB; with budget="):

@@ -9,6 +9,7 @@ import pytest
 from gradient_models import POINTS, SOLVER, TARGET, WEIGHTS, linked
 
 import warpfea as wf
+from warpfea.simulation.initial_adjoint import check_names
 from warpfea.terms.shape_gradients import MeshGradient
 
 LENGTH = 1e-3
@@ -145,6 +146,12 @@ def test_terms_without_a_derivative_are_refused_by_name():
     ctx.model = models.varied(models.beam())
     with pytest.raises(wf.ModelError, match=r"nu of beams and shells .* differs between worlds"):
         MeshGradient(ctx)
+    b = wf.ModelBuilder()
+    box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), material=models.material())
+    turn = wf.Rotation(anchor=(0, 0, 0), axis=(0, 0, 1), angle=([0, 1], [0, 3.0]))
+    b.drive(box.nodes("x-"), rotation=turn)
+    with pytest.raises(wf.ModelError, match=r"'mesh.X' has no derivative with rotations"):
+        check_names(SimpleNamespace(model=b.finalize(device="cpu")), ["mesh.X"])
     ctx.model, ctx.midpoint = models.model(models.solid("T4"), models.material(models.NEO)), True
     with pytest.raises(wf.ModelError, match="'elements': steps of energy_momentum but"):
         MeshGradient(ctx)

@@ -235,6 +235,13 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
             position[world, step, c] = offset[c] + d[c]
             velocity[world, step, c] = s[c]
 
+    @masked_kernel(module, "active")
+    def count_changes(x: p.vec3_2d, y: p.vec3_2d, active: int_1d, count: int_1d):
+        """count[0] += slots whose vectors differ."""
+        world, slot = wp.tid()
+        if not x[world, slot] == y[world, slot]:
+            wp.atomic_add(count, 0, 1)
+
     @wp.kernel(module=module)
     def probe_bars(
         slot: int_1d, weight: p.scalar_1d, step: int, displacement: double_3d, velocity: double_3d,

@@ -27,6 +27,7 @@ from ..terms.gradients import Gradient, StepAdjoint
 from ..terms.protocols import Differentiable
 from ..terms.shape_gradients import MESH, MeshGradient
 from .initial_adjoint import check_initial_conditions, check_names, step_back_to_initial
+from .loss import Loss
 from .sensitivities import Forward
 from .simulation import Simulation
 from .statics import StaticResult
@@ -182,7 +183,7 @@ class Adjoint(Tape):
             Their `switches`: how often contact changed, where derivatives are one-sided.
 
         Raises:
-            ModelError: no step, or parameters that changed since.
+            ModelError: no step, parameters that changed since, or no probe, or a loss of none, of these steps.
             ConvergenceError: a residual above 1e-6, in all worlds that run.
         """
         m, a = self.model, self.solver
@@ -245,8 +246,13 @@ class Adjoint(Tape):
 
     def _take_loss(self, loss: Any) -> None:
         """Write the derivatives of a loss by the probes' arrays to their `.grad`."""
+        arrays = [array for probe in self.probes.values() for array in probe.arrays]
+        if not arrays:
+            raise ModelError("Adjoint: no probe was taken since the last step: probe(name), and a loss of it")
         if loss is not None:
-            for array in (array for probe in self.probes.values() for array in probe.arrays):
+            if isinstance(loss, Loss) and not any(loss.values is array for array in arrays):
+                raise ModelError("Adjoint: the loss is not of this tape's probes, taken since its last step")
+            for array in arrays:
                 array.grad.zero_()
             loss.backward()
 

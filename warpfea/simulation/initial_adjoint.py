@@ -18,6 +18,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.worlds import set_rows
 from ..terms.protocols import Constrained, Differentiable
+from ..terms.shape_gradients import MESH
 from .consistent_initial_conditions import rates_of_vectors, right_sides, term_vectors
 
 if TYPE_CHECKING:
@@ -34,10 +35,12 @@ STEP = 1e-30
 
 
 def check_names(initial: Any, names: Iterable[str]) -> None:
-    """ModelError for a drive that is no control: its rates are accelerations too."""
+    """ModelError for a drive that is no control: its rates are accelerations too, by X where it turns nodes."""
     if initial is None:
         return
-    laws = initial.model.terms.time_laws
+    laws, turn = initial.model.terms.time_laws, initial.model.terms.supports.rotation_drives
+    if MESH in names and turn and any(laws.laws[k].control is None for k in turn.law.numpy().ravel().tolist()):
+        raise ModelError(f"Adjoint: {MESH!r} has no derivative with rotations that generalized_alpha starts from")
     for name in names:
         if name in laws.names and name not in laws.controls and {*laws.indices_of(name)} & initial.drive_law_numbers():
             raise ModelError(f"Adjoint: {name!r} has no derivative with generalized_alpha: give it as a wf.Control")

@@ -100,6 +100,7 @@ class Tape:
             raise ModelError("Adjoint: an equilibrium has no steps to run")
         if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
             self.clear()
+        self._check_state()
         self.kept.expect(steps)
         if not self.kept and self._updates != self.model.terms.parameter_updates:
             self._updates, self._graph = self.model.terms.parameter_updates, None
@@ -181,6 +182,21 @@ class Tape:
     def _check_parameters(self) -> None:
         if self.model.terms.parameter_updates != self._updates:
             raise ModelError("Adjoint: parameters were set after the first step of the tape; reset the simulation")
+
+    def _check_state(self) -> None:
+        """ModelError if the state was set since the last step: its derivatives by that are not known."""
+        if not self.kept:
+            return
+        m, state = self.model, self.sim.state
+        kernel = adjoint_kernels(m.dtype, m.terms.traits.constraint_rows).count_changes
+        count = wp.zeros(1, dtype=wp.int32, device=m.device)
+        active = device_flags(self.sim.status == STATUS["running"], m.device)
+        for name in ("displacement", "velocity"):
+            args = [self.kept[-1][name], getattr(state, name), active, count]
+            self.sim.stepper.launch(kernel, (m.worlds, m.slots), args)
+        if count.numpy()[0]:
+            raise ModelError("Adjoint: the state was set after the first step of the tape; reset the simulation, or "
+                             "clear() the tape")  # fmt: skip
 
     def _kept_names(self) -> list[str]:
         return [name for name in self.sim.state.names if not is_solver_history(name) and name not in NOT_KEPT]

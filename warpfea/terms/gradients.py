@@ -205,7 +205,7 @@ def density_gradient(ctx: StepContext, elements: Any, members: list[Any], name: 
 
     def force(at: StepAdjoint, k: int) -> None:
         w = at.ctx.work
-        args = [topology, arrays[1], m.terms.dead_loads.constant_gravity, w.step.load_factor, w.v, w.v_tilde]
+        args = [topology, arrays[1], m.terms.dead_loads.gravity, w.step.load_factor, w.v, w.v_tilde]
         at.ctx.launch(at.kernels.density_force, at.dim, [*args, w.step.mass_factor, at.active, at.scratch])
 
     return ForceGradient(force, inertia=True)
