@@ -370,6 +370,14 @@ def test_statics_write_themselves_and_series_are_read_back(tmp_path, monkeypatch
     with pytest.raises(wf.OutputError, match=r"one.docx: the file name must end in one of .*\.html.*\.vtu"):
         r.write(tmp_path / "one.docx")
 
+    (tmp_path / "empty").mkdir()
+    with monkeypatch.context() as broken:
+        broken.setattr(Results, "field_on", lambda *_: 1 / 0)
+        for name in ("one.usdc", "one.png", "one.html"):
+            with pytest.raises(ZeroDivisionError):
+                r.write(tmp_path / "empty" / name)
+    assert list((tmp_path / "empty").iterdir()) == []  # nor a temporary file
+
     saved = wf.read_results(tmp_path / "series")
     assert repr(saved) == "SavedResults(box, beam: 3 frames, 1 worlds)"
     assert saved.time == pytest.approx([0.0, 0.5, 1.0])

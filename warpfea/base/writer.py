@@ -1,17 +1,18 @@
 """Output protocol and atomic file writing."""
 
+import contextlib
 import itertools
 import os
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from .errors import OutputError
 from .renamed import check_members
 
 __all__ = [
-    "Output", "check_distinct", "check_folder", "check_target", "make_folder", "register_writer", "temporary_path",
-    "write_atomically", "writer_for",
+    "Output", "aborted_on_error", "check_distinct", "check_folder", "check_target", "make_folder", "register_writer",
+    "temporary_path", "write_atomically", "writer_for",
 ]  # fmt: skip
 
 
@@ -64,6 +65,16 @@ def writer_for(path: str | os.PathLike[str], fields: Sequence[str], **options: A
     if suffix not in WRITERS:
         raise OutputError(f"{path}: the file name must end in one of {', '.join(sorted(WRITERS))}")
     return WRITERS[suffix](path, fields, **options)
+
+
+@contextlib.contextmanager
+def aborted_on_error(writer: Any) -> Iterator[None]:
+    """Discard what a writer began if the block raises."""
+    try:
+        yield
+    except BaseException:
+        writer.abort()
+        raise
 
 
 VIEWERS: list[Callable[..., None]] = []

@@ -20,7 +20,7 @@ from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
 from ..base.checks import check_positive, is_number
 from ..base.errors import ModelError
 from ..base.lazy import require_matplotlib
-from ..base.writer import writer_for
+from ..base.writer import aborted_on_error, writer_for
 from ..model.assembly import require_density
 from ..model.state import State
 from ..terms.checks import overrides
@@ -111,14 +111,15 @@ class Shapes:
         amplitude = DRAWN_SIZE * self.model.size if size is None else size
         step = amplitude * self.vectors[mode - 1] / self._largest()[mode - 1]
         frames = range(CYCLE_FRAMES + 1) if writer.animates else [CYCLE_FRAMES // 4]
-        for k in frames:
-            motion.time[:] = k * CYCLE_S / CYCLE_FRAMES
-            moved = start + np.sin(2.0 * np.pi * k / CYCLE_FRAMES) * step
-            motion.state.displacement.assign(moved.astype(start.dtype))
-            if k == frames[0]:
-                writer.open(motion)
-            writer.write(motion)
-        writer.close(motion)
+        with aborted_on_error(writer):
+            for k in frames:
+                motion.time[:] = k * CYCLE_S / CYCLE_FRAMES
+                moved = start + np.sin(2.0 * np.pi * k / CYCLE_FRAMES) * step
+                motion.state.displacement.assign(moved.astype(start.dtype))
+                if k == frames[0]:
+                    writer.open(motion)
+                writer.write(motion)
+            writer.close(motion)
 
     def label(self, mode: int) -> str:
         """Title of a mode."""

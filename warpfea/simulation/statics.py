@@ -16,7 +16,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.names import check_choice
 from ..base.notebook import drawn_page
-from ..base.writer import Output, writer_for
+from ..base.writer import Output, aborted_on_error, writer_for
 from ..model.assembly import element_volumes, require_density
 from ..model.contact_points import effective_modulus
 from ..model.slot_table import check_static_supports
@@ -98,8 +98,9 @@ class StaticResult:
             ModelError, OutputError: see the writer; another suffix.
         """
         writer = writer_for(path, [fields] if isinstance(fields, str) else fields, **options)
-        for call in (writer.open, writer.write, writer.close):
-            call(self.simulation)
+        with aborted_on_error(writer):
+            for call in (writer.open, writer.write, writer.close):
+                call(self.simulation)
 
     def mode(self, body: Any) -> np.ndarray:
         """Unstable mode (B, nodes, 3) of each world, 0 if none; its largest displacement is 1 m.
