@@ -15,9 +15,15 @@ from ..common.types import double_2d, f64, int_1d, precision, vec3d, vec3d_2d
 from .friction import friction_functions
 from .kinematics import kinematics_functions
 from .law import OwnLaws, law_names
-from .structs import WITH_STIFFNESS, contact_structs
+from .structs import SLIP_FLAG, WITH_STIFFNESS, contact_structs
 
-__all__ = ["contact_adjoint_functions", "contact_adjoint_kernels", "contact_adjoint_struct", "point_bars_struct"]
+__all__ = [
+    "contact_adjoint_functions",
+    "contact_adjoint_kernels",
+    "contact_adjoint_struct",
+    "force_bars_struct",
+    "point_bars_struct",
+]
 
 
 @functools.cache
@@ -65,30 +71,44 @@ def point_bars_struct():
 
 
 @functools.cache
+def force_bars_struct():
+    """Bars of what the laws of a point give."""
+
+    @wp.struct
+    class ForceBars:
+        """Directions on which forces on the residual work, and bars of the history after the step."""
+
+        normal_force: vec3d
+        friction: vec3d
+        slip: vec3d
+        speed: f64
+
+    return ForceBars
+
+
+@functools.cache
 def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
-    """Device function `law_bars`."""
+    """Device functions of the laws: `law_bars`, `is_slipping` and `count_switch`."""
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     law, k = friction_functions(dtype, own), kinematics_functions(dtype)
-    ContactAdjoint, PointBars = contact_adjoint_struct(), point_bars_struct()
+    ContactAdjoint, PointBars, ForceBars = contact_adjoint_struct(), point_bars_struct(), force_bars_struct()
 
     @wp.func
     def law_work(
         con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, point: int, item: int,
-        other_depth: f64, record: PointContact, inv_h: f64, normal_way: vec3d, friction_way: vec3d, slip_way: vec3d,
-        speed_bar: f64,
+        other_depth: f64, record: PointContact, inv_h: f64, way: ForceBars,
     ) -> f64:  # fmt: skip
-        """Work of normal force and friction on the residual along a direction each, of the elastic slip after the step
-        along another one, and of the approach speed after it. `con`: with the point as the contact."""
+        """Sum of what the laws give times its bars `way`. `con`: with the point as the contact."""
         t = record
         t.stiffness_ratio = k.stiffness_ratio(con, facets, world, point, item, other_depth)
         t = law.with_normal_force(con, scr, world, point, point, t, inv_h)
         limits = law.friction_parameters(con, his, world, point, point, t)
         t = law.in_friction_plane(t, t.normal, limits[2])
-        out = wp.dot(friction_way, law.friction_force(con, world, point, t, limits, inv_h))
-        out -= t.normal_values[0] * wp.dot(normal_way, t.normal)
+        out = wp.dot(way.friction, law.friction_force(con, world, point, t, limits, inv_h))
+        out -= t.normal_values[0] * wp.dot(way.normal_force, t.normal)
         if t.normal_values[0] > f64(0.0) and limits[1] > f64(0.0):
-            out += wp.dot(slip_way, law.return_mapping(con, world, point, t, limits, inv_h))
-        return out + speed_bar * wp.max(scr.approach_speed[world, point], inv_h * (t.depth - t.previous_depth))
+            out += wp.dot(way.slip, law.return_mapping(con, world, point, t, limits, inv_h))
+        return out + way.speed * wp.max(scr.approach_speed[world, point], inv_h * (t.depth - t.previous_depth))
 
     @wp.func
     def is_slipping(
@@ -106,15 +126,13 @@ def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     @wp.func
     def law_bars(
         con: Contacts, facets: Facets, his: History, scr: ContactScratch, adj: ContactAdjoint, world: int, point: int,
-        item: int, other_depth: f64, record: PointContact, inv_h: f64, normal_way: vec3d, friction_way: vec3d,
-        slip_way: vec3d, speed_bar: f64,
+        item: int, other_depth: f64, record: PointContact, inv_h: f64, way: ForceBars,
     ) -> PointBars:  # fmt: skip
         """Gradient of `law_work`; that by the constants is added to the gradient arrays of `con`."""
         adj.approach_bar[world, point] = f64(0.0)
-        _con, _facets, _his, _scr, _w, _p, _i, _d, bar, _h, pressed, friction, slip, _s = wp.grad(law_work)(
-            con, facets, his, scr, world, point, item, other_depth, record, inv_h, normal_way, friction_way, slip_way,
-            speed_bar,
-        )  # fmt: skip
+        _con, _facets, _his, _scr, _w, _p, _i, _d, bar, _h, force = wp.grad(law_work)(
+            con, facets, his, scr, world, point, item, other_depth, record, inv_h, way
+        )
         out = PointBars()
         out.normal = bar.normal
         out.depth = bar.depth
@@ -122,10 +140,18 @@ def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         out.motion = bar.relative_motion
         out.spring = bar.spring
         out.approach_speed = adj.approach_bar[world, point]
-        out.normal_force = pressed
-        out.friction = friction
-        out.slip = slip
+        out.normal_force = force.normal_force
+        out.friction = force.friction
+        out.slip = force.slip
         return out
+
+    @wp.func
+    def count_switch(his: History, adj: ContactAdjoint, world: int, point: int, touching: bool, slipping: bool):
+        """Count a point that came into contact in the step, or left it, began to slip or stuck."""
+        was_touching = his.speed[world, point] > f64(0.0)
+        was_slipping = was_touching and his.contact_state[world, point] >= SLIP_FLAG
+        if touching != was_touching or (touching and slipping != was_slipping):
+            wp.atomic_add(adj.switches, world, 1)
 
     return kernel_set(locals())
 

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, int_1d, mat33d, precision, vec3d, vec3d_2d
-from .adjoint import contact_adjoint_functions, contact_adjoint_struct
+from .adjoint import contact_adjoint_functions, contact_adjoint_struct, force_bars_struct
 from .collider_kinematics import collider_kinematics
 from .collider_mesh import FLAT
 from .collider_seams import SEAMS_SUFFIX
@@ -19,7 +19,7 @@ from .collider_shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, LATERAL_SIDE, M
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import kinematics_functions
 from .law import ANY_GAP, FIXED_SPRING, MIN_APPROACH_SPEED, OwnLaws, law_names
-from .structs import IN_REACH, SLIP_FLAG, collider_struct, contact_structs
+from .structs import IN_REACH, collider_struct, contact_structs
 
 __all__ = ["collider_adjoint_kernels"]
 
@@ -97,10 +97,10 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
     """Kernels; arguments as of `contact_kernels`, `law`: the contacts' constants with the points as contacts."""
     p = precision(dtype)
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
-    Colliders, ContactAdjoint = collider_struct(meshes), contact_adjoint_struct()
+    Colliders, ContactAdjoint, ForceBars = collider_struct(meshes), contact_adjoint_struct(), force_bars_struct()
     g, k = collider_kinematics(dtype, meshes, seams), kinematics_functions(dtype)
     a = contact_adjoint_functions(dtype, own)
-    PointBars, law_bars, is_slipping = a.PointBars, a.law_bars, a.is_slipping
+    PointBars, law_bars, is_slipping, count_switch = a.PointBars, a.law_bars, a.is_slipping, a.count_switch
     normal_derivative = normal_derivatives(meshes).normal_derivative
     stored_side = collider_functions(meshes).stored_side
     name = "_".join(["collider_adjoint", dtype, *law_names(own)])
@@ -149,16 +149,17 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
                 B = rotation * B * wp.transpose(rotation)
                 start_depth = k.depth_at_start(con, facets, his, scr, world, c, item, point)
                 for row in range(4):
-                    way = vec3d()
-                    slip_way = vec3d()
-                    speed_bar = f64(0.0)
+                    way = ForceBars()
                     if row < 3:
-                        way[row] = area
+                        unit = vec3d()
+                        unit[row] = area
+                        way.normal_force = unit
+                        way.friction = unit
                     elif t.depth > f64(0.0):
-                        slip_way = world_axes(col, con, c, rotation) * adj.spring_bar[world, point]
-                        speed_bar = adj.speed_bar[world, point]
+                        way.slip = world_axes(col, con, c, rotation) * adj.spring_bar[world, point]
+                        way.speed = adj.speed_bar[world, point]
                     bars = law_bars(law, facets, his, scr, adj, world, point, item, f64(0.0), t,
-                                    k.inverse_step(clock, world), way, way, slip_way, speed_bar)  # fmt: skip
+                                    k.inverse_step(clock, world), way)  # fmt: skip
                     bars = with_side_face(t, bars, start_depth)
                     end = B * bars.normal - bars.depth * t.normal + bars.motion
                     if row < 3:
@@ -166,6 +167,33 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
                             jacobian[row, j] = end[j]
         adj.jacobian[world, point] = jacobian
         adj.end_bar[world, point] = end
+
+    @wp.struct
+    class StartBars:
+        """Bars of a point at the start of a step."""
+
+        position: vec3d
+        velocity: vec3d
+        spring: vec3d
+        speed: f64
+        gap: f64
+        shift: vec3d  # of the collider at the end
+        turn: f64
+        start_shift: vec3d  # of the collider at the start
+        start_turn: f64
+
+    @wp.func
+    def store(adj: ContactAdjoint, world: int, point: int, bars: StartBars):
+        """Store the bars of a point; those of a pose at the end have a part of the step after it."""
+        adj.spring_bar[world, point] = bars.spring
+        adj.speed_bar[world, point] = bars.speed
+        adj.start_bar[world, point] = bars.position
+        adj.velocity_bar[world, point] = bars.velocity
+        adj.gap_bar[world, point] = bars.gap
+        adj.shift_bar[world, point] = bars.shift + adj.start_shift_bar[world, point]
+        adj.turn_bar[world, point] = bars.turn + adj.start_turn_bar[world, point]
+        adj.start_shift_bar[world, point] = bars.start_shift
+        adj.start_turn_bar[world, point] = bars.start_turn
 
     @masked_kernel(module, "active")
     def step_back_points(
@@ -179,15 +207,7 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
         point = facets.first_point + item * facets.point_count + q
         area = facets.area_fraction[q, item]
         before = scr.start_depth[world, point]
-        shift = vec3d()
-        turn = f64(0.0)
-        start_shift = vec3d()
-        start_turn = f64(0.0)
-        start = vec3d()
-        velocity = vec3d()
-        spring_bar = vec3d()
-        speed_bar = f64(0.0)
-        gap = f64(0.0)
+        out = StartBars()
         was_touching = his.speed[world, point] > f64(0.0)
         touching = bool(False)
         slipping = bool(False)
@@ -201,14 +221,13 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
                 start_axes = col.previous_rotation[world, kc]
                 Q = end_axes * wp.transpose(start_axes)
                 B = end_axes * normal_derivative(col, kc, t.local_position, t.feature) * wp.transpose(end_axes)
-                way = -area * k.interpolate(facets, w, world, q, item)
-                slip_way = vec3d()
-                speed_way = f64(0.0)
+                way = ForceBars()
+                way.normal_force = -area * k.interpolate(facets, w, world, q, item)
+                way.friction = way.normal_force
                 if touching:
-                    slip_way = axes * adj.spring_bar[world, point]
-                    speed_way = adj.speed_bar[world, point]
-                bars = law_bars(law, facets, his, scr, adj, world, point, item, f64(0.0), t, inv_h, way, way, slip_way,
-                                speed_way)  # fmt: skip
+                    way.slip = axes * adj.spring_bar[world, point]
+                    way.speed = adj.speed_bar[world, point]
+                bars = law_bars(law, facets, his, scr, adj, world, point, item, f64(0.0), t, inv_h, way)
                 bars = with_side_face(t, bars, before)
                 # at the start
                 y = scr.start_position[world, point]
@@ -224,38 +243,28 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
                 if wp.dot(n, v) > lowest:
                     fast = bars.approach_speed
                 elif lowest > f64(MIN_APPROACH_SPEED):
-                    speed_bar = bars.approach_speed
+                    out.speed = bars.approach_speed
                 C = start_axes * normal_derivative(col, kc, y, side) * wp.transpose(start_axes)
-                velocity = -fast * n
+                out.velocity = -fast * n
                 at_end = B * bars.normal - bars.depth * t.normal
                 moved = (fast * inv_h) * n - bars.motion  # on the end of the collider's material
                 start = wp.transpose(Q) * moved - bars.previous_depth * n + fast * (C * v)
                 axis = col.rotation_axis[kc]
                 anchor = col.rotation_anchor[kc]
                 place = t.position - t.relative_motion
-                shift = moved - at_end
-                turn = wp.dot(axis, wp.cross(t.normal, bars.normal) - wp.cross(t.position - anchor, at_end)
-                              + wp.cross(place - anchor, moved))  # fmt: skip
+                out.shift = moved - at_end
+                out.turn = wp.dot(axis, wp.cross(t.normal, bars.normal) - wp.cross(t.position - anchor, at_end)
+                                  + wp.cross(place - anchor, moved))  # fmt: skip
                 if con.law[c] & FIXED_SPRING == 0:
-                    turn += wp.dot(axis, wp.cross(t.spring, bars.spring) - wp.cross(bars.slip, slip_way))
-                start_shift = -start
-                start_turn = wp.dot(axis, fast * wp.cross(n, v) - wp.cross(x_n - anchor, start))
-                start -= (fast * inv_h) * n
-                gap = bars.depth + bars.previous_depth
+                    out.turn += wp.dot(axis, wp.cross(t.spring, bars.spring) - wp.cross(bars.slip, way.slip))
+                out.start_shift = -start
+                out.start_turn = wp.dot(axis, fast * wp.cross(n, v) - wp.cross(x_n - anchor, start))
+                out.position = start - (fast * inv_h) * n
+                out.gap = bars.depth + bars.previous_depth
                 if was_touching:
-                    spring_bar = wp.transpose(axes) * bars.spring
+                    out.spring = wp.transpose(axes) * bars.spring
                 slipping = is_slipping(law, facets, his, scr, world, point, item, f64(0.0), t, inv_h)
-        adj.spring_bar[world, point] = spring_bar
-        adj.speed_bar[world, point] = speed_bar
-        adj.start_bar[world, point] = start
-        adj.velocity_bar[world, point] = velocity
-        adj.gap_bar[world, point] = gap
-        adj.shift_bar[world, point] = shift + adj.start_shift_bar[world, point]
-        adj.turn_bar[world, point] = turn + adj.start_turn_bar[world, point]
-        adj.start_shift_bar[world, point] = start_shift
-        adj.start_turn_bar[world, point] = start_turn
-        was_slipping = was_touching and his.contact_state[world, point] >= SLIP_FLAG
-        if touching != was_touching or (touching and slipping != was_slipping):
-            wp.atomic_add(adj.switches, world, 1)
+        store(adj, world, point, out)
+        count_switch(his, adj, world, point, touching, slipping)
 
     return kernel_set(locals())

@@ -154,11 +154,10 @@ def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> Kern
 
     @masked_kernel(module, "active")
     def predict_change(
-        step: Step, driven: p.vec3_1d, free: p.vec3_1d, q: p.vec3_2d, v: p.vec3_2d, q_before: p.vec3_2d,
-        v_before: p.vec3_2d, drive: p.vec3_2d, active: int_1d, q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, x: p.vec3_2d,
-        w: p.vec3_2d,
+        step: Step, q: p.vec3_2d, v: p.vec3_2d, q_before: p.vec3_2d, v_before: p.vec3_2d, active: int_1d,
+        q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, x: p.vec3_2d,
     ):  # fmt: skip
-        """Changes of q~ and v~, x = dq~/d + dv~, and w = (change of the position)/d of prescribed components."""
+        """Changes of q~ and v~, and x = dq~/d + dv~."""
         world, slot = wp.tid()
         c = step_coefficients(step, world)
         dq = T(c.a0) * q[world, slot]
@@ -173,10 +172,17 @@ def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> Kern
         if wp.static(accelerated):
             dq += T(c.q_a) * q_before[world, slot]
             dv += T(c.v_a) * q_before[world, slot] + T(c.v_w) * v_before[world, slot]
-        scale = T(1.0) / T(c.dq_dv)
         q_tilde[world, slot] = dq
         v_tilde[world, slot] = dv
-        x[world, slot] = scale * dq + dv
+        x[world, slot] = (T(1.0) / T(c.dq_dv)) * dq + dv
+
+    @masked_kernel(module, "active")
+    def prescribe_change(
+        step: Step, driven: p.vec3_1d, free: p.vec3_1d, q: p.vec3_2d, drive: p.vec3_2d, active: int_1d, w: p.vec3_2d
+    ):
+        """w = (change of the position)/d of prescribed components, 0 of others."""
+        world, slot = wp.tid()
+        scale = T(1.0) / T(step_coefficients(step, world).dq_dv)
         held = q[world, slot] - wp.cw_mul(free[slot] + driven[slot], q[world, slot])
         w[world, slot] = scale * (held + wp.cw_mul(driven[slot], drive[world, slot]))
 

@@ -207,7 +207,7 @@ def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
 
 
 @functools.lru_cache(maxsize=256)
-def body_force_product_kernel(function: wp.Function, dtype: str, take_dtype: str):
+def body_force_product_kernel(function: wp.Function, dtype: str, take_dtype: str, transposed: bool):
     """Kernel of the derivative of `body_force_kernel` along a direction, or its transpose, by that of the field."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -223,7 +223,7 @@ def body_force_product_kernel(function: wp.Function, dtype: str, take_dtype: str
     def add_body_force_product(
         block: Block, members: wp.array(dtype=wp.int32), reference: wp.array(dtype=vec3), origin: wp.vec3d, factor: T,
         u: wp.array2d(dtype=vec3), time: wp.array(dtype=f64), ramp: wp.array(dtype=f64),
-        direction: wp.array2d(dtype=vec3), transposed: int, active: wp.array(dtype=wp.int32), offset: int,
+        direction: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), offset: int,
         contribution: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Factor times sum_q rho w s_i (db/dr) d(r_q) of one element, d the direction; `transposed`: (db/dr)^T."""
@@ -246,7 +246,7 @@ def body_force_product_kernel(function: wp.Function, dtype: str, take_dtype: str
                 d += block.shape[q, i, column] * direction[world, s]
             x = avec3(origin + wp.vec3d(r))
             g = avec3()
-            if transposed != 0:
+            if wp.static(transposed):
                 _d, g, _t = wp.grad(field_work)(avec3(d), x, t)
             else:
                 for c in range(3):
@@ -259,7 +259,7 @@ def body_force_product_kernel(function: wp.Function, dtype: str, take_dtype: str
                 e = offset + i * count + k
                 contribution[world, e] = contribution[world, e] + block.shape[q, i, column] * f
 
-    module = _unique_module("field_product", function, dtype, take_dtype)
+    module = _unique_module("field_product", function, dtype, take_dtype, transposed)
     return wp.Kernel(func=add_body_force_product, module=module)
 
 

@@ -162,8 +162,10 @@ class AdjointSolver:
         for array in (self.force, self.drive):
             array.zero_()
         parameters()
-        args = [step, self.driven, m.topology.free, *self.state_bars, self.drive, active]
-        launch(k.predict_change, self.dim, [*args, self.q_tilde, self.v_tilde, self.predicted, self.w])
+        args = [step, *self.state_bars, active, self.q_tilde, self.v_tilde, self.predicted]
+        launch(k.predict_change, self.dim, args)
+        args = [step, self.driven, m.topology.free, self.q_bar, self.drive, active, self.w]
+        launch(k.prescribe_change, self.dim, args)
         if self.newton.ctx.midpoint:
             self.operator.product(self.q_bar, w.Hp, active, self.topology, start=True)
             launch(self.kernels.subtract_force, self.dim, [w.Hp, step.dq_dv, active, self.force])

@@ -191,9 +191,9 @@ class BodyForceBlock:
     function: wp.Function
     host: Any
 
-    def product(self, dtype: str) -> wp.Kernel:
-        """Device code of the force's derivative."""
-        return body_force_product_kernel(self.function, dtype, argument_precision(self.function, dtype))
+    def product(self, dtype: str, transposed: bool) -> wp.Kernel:
+        """Device code of the force's derivative, or of its transpose."""
+        return body_force_product_kernel(self.function, dtype, argument_precision(self.function, dtype), transposed)
 
 
 class BodyForces(Differentiable):
@@ -283,22 +283,16 @@ class BodyForces(Differentiable):
         m, w = self.model, ctx.work
         for field in self.block_forces:
             args = [field.block.data, field.members, m.slot_table.reference_array, field.origin, ctx.midpoint_factor]
-            args += [
-                w.u_stage,
-                w.stage_time,
-                w.step.load_factor,
-                p,
-                int(transposed),
-                active,
-                self.offset + field.offset,
-            ]
-            ctx.launch(field.product(m.dtype), (m.worlds, field.count), [*args, w.nonpotential_tangent])
+            args += [w.u_stage, w.stage_time, w.step.load_factor, p, active, self.offset + field.offset]
+            kernel = field.product(m.dtype, transposed)
+            ctx.launch(kernel, (m.worlds, field.count), [*args, w.nonpotential_tangent])
 
     def is_symmetric(self, ctx: StepContext) -> bool:
         return False
 
     def prepare_adjoint(self, at: StepAdjoint) -> Iterable[wp.Module]:
-        return {field.product(self.model.dtype).module for field in self.block_forces}
+        ways = (False, True)
+        return {field.product(self.model.dtype, way).module for field in self.block_forces for way in ways}
 
     def hash(self, h: Any) -> None:
         for force in self.model.description.body_forces:
