@@ -138,7 +138,6 @@ SEAMS |= {
     "bodies, askew": (slabs(0.002), {"yaw": -35.0}),
     "bodies, segments": (slabs(0.002), {"clipping": True}),
     "fine bodies, gap": (slabs(0.002, **FINE), {}),
-    "a fine body behind": (slabs(0.002, sides=((8, 6, 1), (16, 12, 1)), element="ENMC"), {}),
     "a fine body before": (slabs(0.002, sides=((16, 12, 1), (8, 6, 1)), element="ENMC"), {}),
     "body of two parts": (one_slab(slabs(0.002)), {}),
 }

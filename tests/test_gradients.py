@@ -20,14 +20,13 @@ CASES = {
     "T4 20": (models.solid("T4"), SVK, 20),
     "T10 5": (models.solid(), NEO, 5),
     "3243 20": (models.beam(), SVK, 20),
-    "3443 1": (models.shell(), SVK, 1),
     "3443 20": (models.shell(), SVK, 20),
     "T4 200": (models.solid("T4"), RIVLIN, 200),
     "T4 rate": (models.solid("T4"), models.material(form="rate"), 5),
 }
 FAST = ("T4 20", "T4 20 generalized_alpha", "T10 5", "3243 20", "T4 20 bdf2", "3243 20 bdf2", "T4 rate")
 SCHEMES = {"T4 20": ("bdf2", "energy_momentum", "generalized_alpha"), "T4 rate": ("generalized_alpha",),
-           "3243 20": ("bdf2", "energy_momentum(rho_inf=0.8)"), "T10 5": ("energy_momentum(rho_inf=0.8)",)}  # fmt: skip
+           "3243 20": ("bdf2", "energy_momentum(rho_inf=0.8)")}  # fmt: skip
 CASES |= {f"{name} {scheme}": (*CASES[name], scheme) for name, schemes in SCHEMES.items() for scheme in schemes}
 CASES = {name: case if len(case) == 4 else (*case, "backward_euler") for name, case in CASES.items()}
 CASES = [pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name not in FAST)) for name, case in CASES.items()]
@@ -67,9 +66,8 @@ def test_gradients_of_a_body(add, law, steps, scheme):
     state = start(m, np.ones((m.worlds, 2)))
     exact = [g[f"body.{name}"][0] * value for name, value in BASE.items()] + [g["gravity"][0] @ GRAVITY]
     exact += [np.sum(g[f"initial.{k}"][0] * getattr(state, k).numpy()[0]) for k in ("displacement", "velocity")]
-    chosen = [k for k, value in enumerate(exact) if not (steps == 1 and k in (0, 1))]  # E and nu: of round-off's size
     errors = best_differences(loss.numpy(), exact)
-    assert (errors[chosen] < TOLERANCE).all(), errors
+    assert (errors < TOLERANCE).all(), errors
     assert (tape.residual < 1e-10).all()
     _, _, _, alone = body_run(add, law, steps, scheme, rows, slice(7, 8))
     assert all(np.array_equal(alone[name][0], g[name][7]) for name in g)  # the bits of a run of its own

@@ -69,10 +69,7 @@ def cases():
         pytest.param(lambda b, shift: solid(b, shift, "T4", 0.0, "rate"), "bdf2", id="T4 rate", marks=slow),
         pytest.param(lambda b, shift: solid(b, shift, "T10", 0.003), "backward_euler", id="curved T10", marks=slow),
         pytest.param(beam, "backward_euler", id="3243"),
-        pytest.param(beam, "bdf2", id="3243 bdf2", marks=slow),
-        pytest.param(beam, "energy_momentum", id="3243 energy_momentum", marks=slow),
         pytest.param(beam, "generalized_alpha", id="3243 generalized_alpha", marks=slow),
-        pytest.param(shell, "backward_euler", id="3443", marks=slow),
         pytest.param(shell, "energy_momentum", id="3443 energy_momentum", marks=slow),
         pytest.param(ancf, "backward_euler", id="H3843", marks=slow),
     ]
