@@ -123,6 +123,19 @@ def test_a_rolling_disc(scheme: str) -> None:
         assert abs(lost) < 1e-5 * energies["kinetic"][0]  # the height's row is not quadratic
 
 
+def test_a_wheel_stands_still() -> None:
+    """On a plane and below one, at default tolerances: its height is known to the round-off of the radius alone."""
+    for scheme, h, up in (("bdf2", 1e-3, 1.0), ("bdf2", 1e-2, 1.0), ("backward_euler", 1e-3, -1.0)):
+        b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+        wheel = b.add_rigid(wf.Cylinder((0, -0.01, 0.2 * up), (0, 0.01, 0.2 * up), 0.2), mass=2.0)
+        b.add_velocity_constraint("roll", wheel.at((0, 0, 0.2 * up)), axis=(0, 1, 0), radius=0.2, normal=(0, 0, up),
+                                  name="roll")  # fmt: skip
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=h, integrator=scheme)
+        sim.step(30)
+        assert sim.joint_force("roll")[0, 2] == pytest.approx(2.0 * 9.81, rel=1e-6)
+        assert np.abs(sim.velocities(wheel)).max() < 1e-8
+
+
 def motor(**options: Any) -> tuple[Any, Any]:
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     part = b.add_rigid(wf.Box((0, 0, 0), (0.1, 0.2, 0.3)), mass=1.0, inertia=(1.0, 1.0, 1.0), name="part")

@@ -84,11 +84,14 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
         f = functions.right_side(con, law_value, world, row)
         v = row_vectors(con, u, world, row)
         c = scale * (formula.value(v[0], v[1], v[2]) - f)
+        size, g = wp.abs(c), scale * formula.gradients(v[0], v[1], v[2])
+        for side in range(3):
+            size += wp.length(g[side]) * wp.length(v[side])  # c cancels on whole vectors
         if wp.static(midpoint):
-            functions.store_gradients(mul.end_gradient, world, row, scale * formula.gradients(v[0], v[1], v[2]))
+            functions.store_gradients(mul.end_gradient, world, row, g)
             v = row_vectors(con, u_stage, world, row)
         store_derivatives(mul.gradient, mul.curvature, world, row, scale, v)
-        functions.store_value(con, mul, u, alpha[world], world, row, scale, f, c)
+        functions.store_value(con, mul, u, alpha[world], world, row, scale, f, c, size)
 
     @wp.kernel(module=module)
     def derivatives(

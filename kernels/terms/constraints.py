@@ -194,13 +194,14 @@ def constraint_functions(dtype: str) -> KernelSet:
 
     @wp.func
     def store_value(
-        con: Constraints, mul: Multipliers, u: p.vec3_2d, alpha: f64, world: int, row: int, scale: f64, f: f64, c: f64
+        con: Constraints, mul: Multipliers, u: p.vec3_2d, alpha: f64, world: int, row: int, scale: f64, f: f64, c: f64,
+        size: f64,
     ):  # fmt: skip
         """Store c and f of a row, its multiplier at the trial step, and its part of the augmented potential.
 
-        The size of that part, of which round-off is a fraction, follows the summands of c, which cancel.
+        The size of that part, of which round-off is a fraction, follows the summands of c, which cancel: displacements,
+        and `size`.
         """
-        size = wp.abs(c)
         for term in range(3 * row, 3 * row + 3):
             size += wp.length(mul.gradient[world, term]) * term_size(con, term, u, world)
         rho = mul.penalty[world, row]
@@ -311,7 +312,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
                 if wp.isfinite(mul.last_target[world, row]):
                     angle = f64(0.5) * (mul.last_target[world, row] + f)
         functions.store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, angle, slope, b, a2))
-        functions.store_value(con, mul, u, alpha[world], world, row, scale, f, c)
+        functions.store_value(con, mul, u, alpha[world], world, row, scale, f, c, wp.abs(c))
 
     @masked_kernel(module, "active")
     def product_terms(con: Constraints, mul: Multipliers, p_in: p.vec3_2d, dq_dv: double_1d, active: int_1d):

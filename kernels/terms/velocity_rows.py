@@ -117,6 +117,6 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
             target = moved / con.scale[row]
             if wp.isfinite(mul.last_target[world, row]):
                 target += mul.last_target[world, row]
-        functions.store_value(con, mul, u, alpha[world], world, row, con.scale[row], target, c)
+        functions.store_value(con, mul, u, alpha[world], world, row, con.scale[row], target, c, wp.abs(c))
 
     return kernel_set(locals())
