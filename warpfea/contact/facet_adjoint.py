@@ -9,7 +9,12 @@ from typing import Any
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.contact.facet_adjoint import FACET_POINTS, facet_adjoint_kernels, facet_adjoint_struct
+from ..kernels.contact.facet_adjoint import (
+    FACET_POINTS,
+    adjoint_fields_struct,
+    facet_adjoint_kernels,
+    facet_adjoint_struct,
+)
 from ..kernels.contact.facet_structs import pair_scratch_struct, point_list_struct
 from ..kernels.contact.point_lists import FACETS_PER_CHUNK
 from ..terms.gradients import StepAdjoint, with_fields
@@ -67,10 +72,13 @@ class DifferentiableFacets(DifferentiableContact):
     ) -> None:  # fmt: skip
         """Bars of the points and of their places on facets."""
         a, s = self.adjoint(ctx), ctx.scratch[self.name]
+        fields = adjoint_fields_struct(self.model.dtype)()
+        fields.displacement, fields.velocity, fields.way = s["u"], ctx.state.velocity, way
+        fields.force_weight, fields.history_weight = weights
+        fields.at_start = int(at_start)
         for group in self.tables.groups:
-            args = [self.tables.data, constants, s["other"], group.data, s["history"], s["clock"], s["u"]]
-            args += [ctx.state.velocity, way, active, wp.vec2d(*weights), int(at_start)]
-            args += [a.attempt, a.data, s["facet bars"]]
+            args = [self.tables.data, constants, s["other"], group.data, s["history"], s["clock"], fields]
+            args += [active, a.attempt, a.data, s["facet bars"]]
             ctx.launch(self.adjoint_kernels.adjoint_of_points, group.point_threads(self.model.worlds), args)
 
     def _gather_facets(self, ctx: StepContext, active: wp.array, parts: list[tuple[int, int, int]]) -> None:
