@@ -134,6 +134,29 @@ def test_initial_accelerations_of_moving_joints():
     assert (errors < TOLERANCE).all(), errors
 
 
+def test_restarted_accelerations():
+    """A drive with a kink within a step: velocities jump and accelerations restart at its end."""
+    rows, scale = shifts(3), np.array([1e6, 1000.0])
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    box = b.add_solid(wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"), material=LAW, name="box")
+    b.drive(box.nodes("x-"), displacement=([0, 3e-3, 1], [(0, 0, 0), (0, 0, 0), (0, 0, 1.0)]))
+    b.add_probe("tip", box.surface("x+"))
+    m = b.finalize(device="cpu", worlds=len(rows), many=False)
+    for name, value, of in zip(("box.E", "box.density"), scale, rows.T):
+        m.set_parameter(name, value * (1.0 + of))
+    m.set_gravity(GRAVITY * (1.0 + rows[:, 2:]))
+    sim = wf.Simulation(m, dt=2e-3, integrator="generalized_alpha", solver=SOLVER)
+    tape = wf.Adjoint(sim, ["box.E", "box.density", "gravity"])
+    tape.run(4)
+    assert list(tape.restarts) == [0, 2]
+    assert tape.probe("tip").velocity.numpy() == pytest.approx(sim.probe("tip").velocity, rel=1e-12, abs=1e-15)
+    loss = wf.loss.sum_of_squares(tape.probe("tip").velocity, np.full((4, 3), TARGET))
+    g = {name: array.numpy()[0] for name, array in tape.backward(loss).items()}
+    exact = [*(scale * (g["box.E"], g["box.density"])), g["gravity"] @ GRAVITY]
+    errors = best_differences(loss.numpy(), exact)
+    assert (errors < TOLERANCE).all(), errors
+
+
 FORWARD = [("followers", "backward_euler"), ("drives", "bdf2"), ("loads", "energy_momentum")]
 
 
@@ -426,6 +449,8 @@ def test_misuse_is_refused():
         tape.probe("tap")
     with pytest.raises(wf.CapacityError, match=r"3 steps of .* of 1.0 kB; with budget="):
         wf.Adjoint(sim, "gravity", budget=1000).run(3)
+    with pytest.raises(wf.ModelError, match="folder"):
+        wf.Adjoint(sim, "gravity", folder="no such folder")
     m.set_gravity((0, 0, 1.0))
     with pytest.raises(wf.ModelError, match="parameters were set"):
         tape.backward()

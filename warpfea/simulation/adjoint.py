@@ -330,11 +330,11 @@ class Adjoint(Tape):
             command.set_param_at_index(2, k)
             command.launch()
         if self.mesh:
-            self.mesh.add_probes(self.stepper.launch, self.probes, k, self.kept[self.ends[k]], self._sums[MESH])
+            self.mesh.add_probes(self.stepper.launch, self.probes, k, self.end_of_part(self.ends[k]), self._sums[MESH])
 
     def load(self, part: int) -> None:
         """The state at the start of a part of a step, with the joint forces and velocities at its end."""
-        start, end = self.kept[part], self.kept[part + 1]
+        start, end = self.kept[part], self.end_of_part(part + 1)
         for name, array in start.items():
             into = {"dt": self.stepper.work.step.dt, "impact": self.impact}.get(name) or getattr(self.state, name)
             wp.copy(into, end[name] if name == "constraint_force" else array)

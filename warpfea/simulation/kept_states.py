@@ -47,6 +47,8 @@ class KeptStates(list[dict[str, wp.array]]):
     ) -> None:
         super().__init__()
         self.sim, self.budget = sim, budget
+        if folder is not None and not os.path.isdir(folder):
+            raise ModelError(f"Adjoint: folder = {os.fspath(folder)!r} does not exist")
         self.controls = [control_array(name) for name in sim.model.terms.time_laws.controls]
         self.names = [name for name in names if name not in self.controls]
         arrays = sim.state.bytes

@@ -217,11 +217,18 @@ class Tape:
             out = self.probes[name] = self._empty_probe(name, self.steps)
             for k, end in enumerate(self.ends):
                 if self.budget is None:
-                    self._evaluate_probe(out, k, self.kept[end])
+                    self._evaluate_probe(out, k, self.end_of_part(end))
                 else:
                     for array, value in zip(out.arrays, self._probe_values[name][k].arrays):
                         wp.copy(array[:, k], value[:, 0])
         return self.probes[name]
+
+    def end_of_part(self, k: int) -> dict[str, wp.array]:
+        """The state kept at an index, with the velocities before a restart of accelerations there."""
+        if k not in self.restarts:
+            return self.kept[k]
+        before: wp.array = wp.array(self.restarts[k][1], dtype=self.model.types.vec3, device=self.model.device)
+        return self.kept[k] | {"velocity": before}
 
     def _empty_probe(self, name: str, steps: int) -> ProbeArrays:
         m = self.model
