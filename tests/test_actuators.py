@@ -384,6 +384,7 @@ def test_bad_input_is_named() -> None:
     cases: list[tuple[Any, str]] = [
         (lambda: wf.Stop(0.3, -0.3), "wrong way round"),
         (lambda: wf.Stop(0.3, 0.3), "at one place"),
+        (lambda: wf.Stop(None, 0.3), "must be two numbers; inf is no end"),  # type: ignore[arg-type]
         (lambda: wf.Stop(0.0, 1.0, stiffness=-1.0), "stiffness = -1.0"),
         (lambda: wf.PD(-1.0), "kp = -1.0"),
         (lambda: wf.PD(1.0, kd=np.nan), "kd = nan"),

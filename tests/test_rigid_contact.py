@@ -51,6 +51,11 @@ def test_a_speck_far_from_its_place_is_refused_for_round_off():
     with pytest.raises(wf.ConstraintError, match=r"round-off of positions .* m from the reference is larger"):
         sim.run(2.0)
     assert sim.pose("speck")[0][0, 2] < -1.0
+    b = wf.ModelBuilder()  # a point of 30 um that is drawn as a box of 1 m
+    part = b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), mass=1.0, inertia=(1e-9, 1e-9, 1e-9))
+    b.set_initial(part, angular_velocity=(1.0, 0.1, 0.2))
+    with pytest.raises(wf.ConvergenceError, match="inertias beside mass times size"):
+        wf.Simulation(b.finalize(device="cpu"), dt=1e-2, integrator="energy_momentum").run(0.3)
 
 
 def test_a_wedge_under_a_block():

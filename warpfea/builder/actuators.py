@@ -74,7 +74,7 @@ class Stop:
     def __post_init__(self) -> None:
         for end in (self.lower, self.upper):
             if isinstance(end, bool) or not isinstance(end, (int, float, np.number)) or math.isnan(end):
-                raise ModelError(f"wf.Stop: ends ({self.lower!r}, {self.upper!r}) must be two numbers")
+                raise ModelError(f"wf.Stop: ends ({self.lower!r}, {self.upper!r}) must be two numbers; inf is no end")
         if not self.lower < self.upper:
             where = "at one place" if self.lower == self.upper else "the wrong way round"
             raise ModelError(f"wf.Stop: ends ({self.lower!r}, {self.upper!r}) are {where}; the lower comes first")

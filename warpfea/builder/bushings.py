@@ -39,7 +39,7 @@ def make_bushing(
     vectors += [[(x - y,)] for x, y in zip(a, b)]
     vectors += [[(x, y)] for x in a for y in b]
     values = np.stack([bushing_parts(k, damping=False), bushing_parts(c, damping=True)], axis=1)
-    built = values.any(axis=1)
+    built = np.asarray(values.any(axis=1))
     built[3:6] |= k[3:].any()  # one of them vanishes where k_5 + k_6 = k_4: other values may need it
     built[6::4] |= c[3:].any()
     parts = np.flatnonzero(built).tolist()

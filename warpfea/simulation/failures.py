@@ -103,7 +103,10 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     if code == codes.Failure.CURVATURE and direct is not None and world in direct.singular_worlds:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
     near = float(work.newton.floor.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
-    finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
+    parts = all(getattr(body, "rigid", False) for body in sim.model.bodies)
+    finer = "; check the units, and inertias beside mass times size^2" if parts else (
+        "; use fewer, stouter elements, or check the units")  # fmt: skip
+    finer = "; use float64" if dtype == "float32" else finer
     adaptive = sim.stepper.step_size_control
     if code == codes.Failure.ROUNDOFF and adaptive and (least := adaptive.smallest_resolved_error(world)):
         hides = f"{dtype} round-off of displacements hides the local errors of substeps"
