@@ -278,6 +278,16 @@ def test_equilibrium():
         tape.run(1)
 
 
+def test_frequency_by_the_modulus():
+    """d ln f / d ln E = 1/2 by `wf.modes`."""
+    factors, found = 1.0 + 1e-2 * np.array([-2.0, -1.0, 1.0, 2.0]), []
+    for factor in factors:
+        m = bar(lambda b, box: b.clamp(box.nodes("x-")), law=wf.SVK(E=1e6 * factor, nu=0.3, density=1000.0))
+        found.append(np.log(wf.modes(m, count=2).frequencies))
+    rate = np.array([1.0, -8.0, 8.0, -1.0]) @ np.array(found) / 12e-2
+    assert rate == pytest.approx(0.5, rel=1e-6)
+
+
 @wp.kernel
 def swirl_force(scale: wp.float64, x: wp.array2d[wp.vec3d], active: wp.array[wp.int32], out: wp.array2d[wp.vec3d]):
     """scale (z x x) of all slots."""
