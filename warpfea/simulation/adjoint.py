@@ -179,7 +179,8 @@ class Adjoint(Tape):
 
         Returns:
             arrays [world] of constants, [world, 3] of gravity, [world, step, size] of controls (of statics [world,
-                size]), [world, slot] of initial values and "mesh.X"; NaN in worlds that failed or are frozen, at their `t_end` too.
+                size]), [world, slot] of initial values and "mesh.X"; NaN in worlds that failed or are frozen, at their
+                `t_end` too.
             Their `switches`: how often contact changed, where derivatives are one-sided.
 
         Raises:
