@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,16 @@ from . import assembly
 if TYPE_CHECKING:
     from .discretisation import Discretisation
 
-__all__ = ["MassPart", "Masses", "all_mass_parts", "body_mass", "center_of_mass", "has_constant_density", "mass_parts"]
+__all__ = [
+    "MassPart",
+    "Masses",
+    "all_mass_parts",
+    "body_mass",
+    "center_of_mass",
+    "element_mass_matrices",
+    "has_constant_density",
+    "mass_parts",
+]
 
 
 def _entry_keys(matrix: sp.csr_matrix) -> np.ndarray:
@@ -44,11 +54,25 @@ def has_constant_density(material: Material) -> bool:
     return not callable(assembly.density_of(material)) and np.ndim(assembly.density_of(material)) == 0
 
 
+def element_mass_matrices(body: Any, material: int) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """Chunks of the elements of a material: elements, their scalar matrices (E, S, S) of Eq. (20) over the scale of
+    the material, see MassPart, and their mass over it."""
+    flat = assembly.is_straight(body)
+    for affine in (True, False):
+        chosen = np.flatnonzero((flat == affine) & (body.material_of == material))
+        rule = assembly.mass_rule(body, affine)
+        for part in assembly.element_chunks(body, chosen, len(rule.weights)):
+            s, _, _, det = assembly.shape_and_jacobian(body, part, rule.points)
+            w = assembly.density_at(body, part, s, body.connectivity[part], assembly.UNIT_DENSITY) * det * rule.weights
+            subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
+            table = s[0] if len(s) == 1 else s
+            yield part, np.einsum(subscripts, w, table, table, optimize=True), float(w.sum())
+
+
 def mass_parts(body: Any) -> list[MassPart]:
     """Consistent scalar mass m_ij = int rho s_i s_j dV (Eq. 20) of each material of a body."""
     if body.rigid:
         return [MassPart(body.materials[0][1].density, body.scalar_mass, body.moments[0, 0])]
-    flat = assembly.is_straight(body)
     n = body.slot_count
     scales = [
         float(assembly.density_of(m)) if has_constant_density(m) else assembly.UNIT_DENSITY for _, m in body.materials
@@ -56,23 +80,15 @@ def mass_parts(body: Any) -> list[MassPart]:
     out = []
     for k, scale in enumerate(scales):
         sums, mass = [sp.csr_matrix((n, n))], 0.0
-        for affine in (True, False):
-            chosen = np.flatnonzero((flat == affine) & (body.material_of == k))
-            rule = assembly.mass_rule(body, affine)
-            for part in assembly.element_chunks(body, chosen, len(rule.weights)):
-                conn = body.connectivity[part]
-                s, _, _, det = assembly.shape_and_jacobian(body, part, rule.points)
-                w = assembly.density_at(body, part, s, conn, assembly.UNIT_DENSITY) * det * rule.weights
-                mass += float(w.sum())
-                subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
-                table = s[0] if len(s) == 1 else s
-                local = np.einsum(subscripts, w, table, table, optimize=True)
-                S = conn.shape[1]
-                rows = np.repeat(conn, S, axis=1).ravel()
-                cols = np.tile(conn, (1, S)).ravel()
-                sums.append(sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n)))
-                while len(sums) > 1 and sums[-2].nnz <= 2 * sums[-1].nnz:  # a sum copies all of both
-                    sums[-2:] = [sums[-2] + sums[-1]]
+        for part, local, total in element_mass_matrices(body, k):
+            mass += total
+            conn = body.connectivity[part]
+            S = conn.shape[1]
+            rows = np.repeat(conn, S, axis=1).ravel()
+            cols = np.tile(conn, (1, S)).ravel()
+            sums.append(sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n)))
+            while len(sums) > 1 and sums[-2].nnz <= 2 * sums[-1].nnz:  # a sum copies all of both
+                sums[-2:] = [sums[-2] + sums[-1]]
         out.append(MassPart(scale, sum(sums[1:], sums[0]), mass))
     return out
 

@@ -6,6 +6,7 @@ the registry.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,10 @@ class State:
         velocity: [world, slot] vec3, m/s.
         time: [world] float64, s.
         worlds, device: as in the model.
+        step_loads: of the state of a simulation, see `step_loads` in simulation/sampling.py.
     """
+
+    step_loads: Callable[[], tuple[np.ndarray, np.ndarray] | None] = staticmethod(lambda: None)
 
     displacement: wp.array
     velocity: wp.array

@@ -4,7 +4,9 @@ contacts."""
 from __future__ import annotations
 
 import warnings
+import weakref
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,7 +34,7 @@ from ..terms.protocols import Touching
 from ..terms.springs import Springs
 from ..terms.term import FieldSpec
 from .reports import ContactRecord, JointRecord, ProbeRecord
-from .sampling import RECORDED_FIELDS, History, joint_history, sampler
+from .sampling import RECORDED_FIELDS, History, accelerations, joint_history, sampler, step_loads
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -209,6 +211,7 @@ class Records:
         self.warned_of_noise = False
         self.model, self.state = results.model, results.state
         self.histories: list[History] = []
+        self.state.step_loads = partial(step_loads, weakref.ref(stepper), statistics)
 
     def energies(self) -> dict[str, np.ndarray]:
         """Energy ledger, each (B,), J.
@@ -269,13 +272,10 @@ class Records:
 
     def at_nodes(self, name: str, body: Body) -> np.ndarray:
         """A field of RECORDED_FIELDS (B, nodes, 3) at the last accepted step; NaN as for `reaction`."""
-        w, state = self.stepper.work, self.state
         if name == "reaction":
-            values = w.g.numpy() * (1.0 - self.model.slot_table.free)
-        elif "acceleration" in state.names:
-            values = state.acceleration.numpy()
-        else:  # of the inertia term m M (v - v~)
-            values = w.step.mass_factor.numpy()[:, None, None] * (w.v.numpy() - w.v_tilde.numpy())
+            values = self.stepper.work.g.numpy() * (1.0 - self.model.slot_table.free)
+        else:
+            values = accelerations(self.stepper)
         out = self.results.at_mesh_nodes(body, values.astype(float))
         out[~self.statistics.stepped_worlds] = np.nan
         return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +17,42 @@ from ..terms.term import FieldSpec
 if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
+    from .reports import RunStatistics
+    from .stepper import Stepper
 
-__all__ = ["RECORDED_FIELDS", "History", "Sampler", "joint_history", "sampler"]
+__all__ = ["RECORDED_FIELDS", "History", "Sampler", "accelerations", "joint_history", "sampler", "step_loads"]
 
 RECORDED_FIELDS = {
     "acceleration": FieldSpec("acceleration", "m/s2", components=VECTOR),
     "reaction": FieldSpec("reaction", "N", components=VECTOR),
 }
 """Fields at nodes that need the last step of a simulation."""
+
+
+def accelerations(stepper: Stepper) -> np.ndarray:
+    """Accelerations (worlds, slots, 3) of the last step, m/s^2."""
+    w, state = stepper.work, stepper.state
+    if "acceleration" in state.names:
+        return np.asarray(state.acceleration.numpy())
+    # of the inertia term m M (v - v~)
+    return np.asarray(w.step.mass_factor.numpy()[:, None, None] * (w.v.numpy() - w.v_tilde.numpy()))
+
+
+def step_loads(reference: weakref.ref[Stepper], statistics: RunStatistics) -> tuple[np.ndarray, np.ndarray] | None:
+    """Gravity less acceleration (worlds, slots, 3), m/s^2, and values of the time laws (worlds, laws, 3), both of the
+    last step; zero in worlds without one, whose accelerations are unknown. None once the stepper is gone."""
+    stepper = reference()
+    if stepper is None:
+        return None
+    w, loads = stepper.work, stepper.terms.dead_loads
+    gravity = loads.gravity.numpy()
+    if loads.gravity_law is None:
+        gravity = w.step.load_factor.numpy()[:, None] * gravity
+    pull = gravity[:, None] * stepper.model.slot_table.is_position[:, None]
+    if not stepper.integrator.static:
+        pull = pull - accelerations(stepper)
+    flags = statistics.stepped_worlds[:, None, None]
+    return np.where(flags, pull, 0.0), np.where(flags, w.time_law_stage_values.numpy(), 0.0)
 
 
 class PointWeights:

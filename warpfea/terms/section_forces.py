@@ -1,5 +1,5 @@
-"""Section forces of beams from the consistent nodal forces at a cut, and resultants of shells from the stress at their
-faces, at the nodes and in the present axes of the section."""
+"""Section forces of beams from the nodal forces of elements less the loads on them, and resultants of shells from the
+stress at their faces, at the nodes and in the present axes of the section."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ModelError
+from ..model.assembly import facet_areas, facet_tables
+from ..model.masses import element_mass_matrices
 from .fields import matrix
 from .term import FieldSpec
 
@@ -56,9 +58,37 @@ def _present_axes(body: Any, state: State) -> tuple[np.ndarray, np.ndarray]:
     return values, np.stack([t, second, np.cross(t, second)], axis=2)
 
 
+def _element_loads(model: Model, body: Any, state: State) -> np.ndarray:
+    """Consistent loads (worlds, elements, slots, 3) of weight, inertia and tractions on side faces on each element, so
+    that the nodal forces less these are the resultants at its ends."""
+    out = np.zeros((model.worlds, *body.connectivity.shape, 3))
+    known = state.step_loads()
+    if known is None:
+        return out
+    pull, law_values = known[0][:, body.slot_range], known[1]
+    if pull.any():
+        index = [b is body for b in model.bodies].index(True)
+        for k in range(len(body.materials)):
+            scale = model.masses.scales[index, k][:, None, None, None]
+            for part, mass, _ in element_mass_matrices(body, k):
+                out[:, part] += scale * np.einsum("eij,bejc->beic", mass, pull[:, body.connectivity[part]])
+    for surface, law in model.terms.dead_loads.tractions:
+        if surface.body is body and len(surface):
+            tables = facet_tables(surface)
+            weights = np.einsum("fq,fqi->fi", facet_areas(body, tables), tables.shape)
+            elements = surface.faces[:, 0]
+            slots = np.argmax(body.connectivity[elements][:, None] == tables.conn[:, :, None], axis=2)
+            second = slots >= out.shape[2] // 2
+            side = ((weights != 0.0) & second).any(axis=1) & ((weights != 0.0) & ~second).any(axis=1)  # no end face
+            weights = np.where(side[:, None], weights, 0.0)
+            at: Any = slice(None), elements[:, None], slots
+            np.add.at(out, at, weights[:, :, None] * law_values[:, law, None, None])
+    return out
+
+
 def _of_beam(model: Model, body: Any, state: State) -> np.ndarray:
     """Force and moment of the beam after a node on the part before it; at the end those of the load on the beam."""
-    forces = model.evaluation.element_forces(state, body)
+    forces = model.evaluation.element_forces(state, body) - _element_loads(model, body, state)
     values, axes = _present_axes(body, state)
     out = np.zeros((model.worlds, len(body.mesh.points), 2, 3))
     cells, slots = body.mesh.cells, forces.shape[2] // 2
