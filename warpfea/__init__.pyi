@@ -19,6 +19,7 @@ from .base.errors import (
 )
 from .base.version import __version__ as __version__
 from .builder.actuators import PD as PD
+from .builder.actuators import Friction as Friction
 from .builder.actuators import Stop as Stop
 from .builder.beams import spline as spline
 from .builder.builder import ModelBuilder as ModelBuilder

@@ -174,15 +174,13 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
 
     # in a step
 
-    def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+    def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int = 0) -> None:
         if fresh:
             self._choose_deepest(ctx, active, fresh=1)
         if fresh or not ctx.midpoint:
             self._place_rolling(ctx, active)
 
-    def _find_accepted(self, ctx: StepContext, accepted: wp.array) -> None:
-        if not ctx.midpoint:
-            self._place_rolling(ctx, accepted)
+    _find_accepted = _find_other
 
     def _place_rolling(self, ctx: StepContext, active: wp.array) -> None:
         """Points that roll, at work.u."""
