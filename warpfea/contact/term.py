@@ -261,7 +261,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             dim = (self.model.worlds, group.count, group.conn.shape[1])
             ctx.launch(self.point_kernels.diagonal, dim, args)
 
-    def _find_accepted(self, ctx: StepContext, accepted: wp.array) -> None:
+    def _find_accepted(self, ctx: StepContext, active: wp.array) -> None:
         """Find the other side of each point at the accepted iterate, where that is another one."""
 
     @part()
