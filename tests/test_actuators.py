@@ -164,6 +164,17 @@ def test_stops_never_throw_back() -> None:
             assert losses[-1] < speed**2
 
 
+def test_adaptive_steps_resolve_a_stop() -> None:
+    """A critically damped stop hit at 10 rad/s: v t exp(-w t) until 2/w, then e^-2 of the speed. The requested error is
+    kept, and ten times the accuracy takes about twice the substeps (by backward Euler: ten times, refused)."""
+    b, _, hinge = rotor(10.0, limits=(-10.0, 0.2))
+    exact = 0.2 + 10.0 * np.exp(-2.0) * (0.02 / np.pi - 0.01)
+    for error in (1e-5, 1e-6):
+        sim = wf.Simulation(b.finalize(device="cpu"), dt="auto", error=error, integrator="bdf2", **TIGHT)
+        sim.run(0.03)
+        assert abs(sim.joint_value(hinge)[0] - exact) < error and sim.totals["substeps"][0] < 5.0 / np.sqrt(error)
+
+
 def test_a_load_just_below_the_friction_is_held() -> None:
     """Friction of 1.01 times a load that acts at once: the joint rests on its stick spring, 1e-4 rad / 1.01, whose
     damper takes half of the load's work; that of the spring alone, without slip, is no loss."""

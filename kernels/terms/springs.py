@@ -345,9 +345,11 @@ def spring_kernels(
 
         @wp.kernel(module=module)
         def find_impacts(
-            spr: Springs, u: p.vec3_2d, h: double_1d, running: int_1d, failed: int_1d, scr: Scratch, impact: int_1d
+            spr: Springs, u: p.vec3_2d, h: double_1d, dq_dv: double_1d, running: int_1d, failed: int_1d, scr: Scratch,
+            impact: int_1d,
         ):  # fmt: skip
-            """Flag worlds whose converged attempt changes the penetration of a stop by more than half of it."""
+            """Flag worlds whose converged attempt changes the penetration of a stop by more than half of it, or that of
+            a strong damper, but where the force changes by less than 1 %: the step resolves the impact."""
             world, item = wp.tid()
             sp = spr.spring[item]
             if running[world] == 0 or failed[world] != 0 or impact[world] != 0 or spr.law[sp] != STOP:
@@ -358,8 +360,12 @@ def spring_kernels(
             y = c.coordinate(spr.kind[item], spr.reference[item] + vectors(spr, u, world, item), y0)
             winding = scr.winding[world, item]
             before, depth = more.penetration(spr, world, sp, winding, y0), more.penetration(spr, world, sp, winding, y)
-            k = spr.stiffness[world, sp]
-            change = (k + spr.damping[world, sp] / h[world]) * wp.abs(depth - before)
+            k, damping = spr.stiffness[world, sp], spr.damping[world, sp]
+            rate, mean_rate = (y - scr.reference[world, item]) / dq_dv[world], (y - y0) / h[world]
+            force_change = k * wp.abs(depth - before) + f64(2.0) * damping * wp.abs(rate - mean_rate)
+            if depth * before > f64(0.0) and force_change < f64(0.01) * wp.abs(k * depth + damping * rate):
+                return
+            change = (k + damping / h[world]) * wp.abs(depth - before)
             if change > f64(0.5) * k * wp.max(wp.abs(depth), wp.abs(before)):
                 impact[world] = IMPACT_FOUND
 

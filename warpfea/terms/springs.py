@@ -305,7 +305,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
     @part("springs")
     def find_impacts(self, ctx: StepContext) -> None:
         w = ctx.work
-        args = [self.data, w.u, w.step.h, w.step.running, w.newton.failed, ctx.scratch[self.name][0]]
+        args = [self.data, w.u, w.step.h, w.step.dq_dv, w.step.running, w.newton.failed, ctx.scratch[self.name][0]]
         ctx.launch(self.kernels(ctx).find_impacts, self.dim, [*args, w.step.impact])
 
     @part("springs")
