@@ -110,20 +110,10 @@ def record(device: str) -> None:
                     f'"calls": [\n{lines}\n]\n}}\n')  # fmt: skip
 
 
-def spread(calls: list, most: int) -> list:
-    """At most so many calls of each factory, from the first to the last."""
-    by_factory: dict = {}
-    for call in calls:
-        by_factory.setdefault((call[0], call[1]), []).append(call)
-    rows = by_factory.values()
-    return [row[k * (len(row) - 1) // max(most - 1, 1)] if len(row) > most else row[k]
-            for row in rows for k in range(min(most, len(row)))]  # fmt: skip
-
-
-def compile_all(folder: str, most: int) -> list[str]:
+def compile_all(folder: str) -> list[str]:
     """Compile the recorded modules for CUDA and print how long each took; their names."""
     wp.is_cuda_available = lambda: True  # options of modules are those of a machine with a device
-    for module, factory, args, kwargs in spread(json.loads(FILE.read_text())["calls"], most):
+    for module, factory, args, kwargs in json.loads(FILE.read_text())["calls"]:
         make = getattr(importlib.import_module(module), factory)
         make(*map(decoded, args), **{k: decoded(v) for k, v in kwargs.items()})
     every = wp._src.context.user_modules.values()
@@ -144,12 +134,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--record", action="store_true", help="write the calls, in place of compiling")
     parser.add_argument("--device", default="cuda", help="to record on")
-    parser.add_argument("--most", type=int, default=1000, help="modules of a factory to compile")
     options = parser.parse_args()
     if options.record:
         return record(options.device)
     with tempfile.TemporaryDirectory() as folder:
-        rows = compile_all(folder, options.most)
+        rows = compile_all(folder)
     print(f"{len(rows)} modules compiled for sm_{ARCH}")
 
 

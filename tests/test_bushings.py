@@ -80,6 +80,21 @@ def test_oscillators():
     assert wrench[1, 3] == pytest.approx(w**2 * J * exact[1, 2] + damping[1, 3] * exact[1, 3], rel=2e-2)
 
 
+def test_damped_turn():
+    """theta'' + 2 z w theta' + w^2 theta = 0 about one axis, of 2.5 rad at first, of second order."""
+    J, w, z = 1.0 / 600.0, 40.0, 0.05
+    errors = []
+    for h in (4e-3, 2e-3):
+        b, part = mounted(stiffness=(1e3, 1e3, 1e3, *3 * [J * w**2]), damping=(0, 0, 0, *3 * [2 * z * w * J]))
+        b.set_initial(part, angular_velocity=(0, 0, 100.0))
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=h, integrator="energy_momentum", solver=EXACT)
+        sim.run(0.12)
+        s = w * np.sqrt(1 - z**2)
+        errors.append(turn_of(sim, part)[2] - 100.0 / s * np.exp(-z * w * 0.12) * np.sin(s * 0.12))
+    assert abs(errors[1]) < 2e-2
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
+
+
 def test_energy_and_momentum_of_two_parts():
     """Free parts that tumble on a bushing keep all three, without loss; each world its own."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))

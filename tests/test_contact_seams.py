@@ -137,7 +137,9 @@ SEAMS |= {
     "bodies, alpha": (slabs(0.002), {"integrator": "generalized_alpha"}),
     "bodies, askew": (slabs(0.002), {"yaw": -35.0}),
     "bodies, segments": (slabs(0.002), {"clipping": True}),
+    "fine bodies": (slabs(**FINE), {}),
     "fine bodies, gap": (slabs(0.002, **FINE), {}),
+    "a fine body behind": (slabs(0.002, sides=((8, 6, 1), (16, 12, 1)), element="ENMC"), {}),
     "a fine body before": (slabs(0.002, sides=((16, 12, 1), (8, 6, 1)), element="ENMC"), {}),
     "body of two parts": (one_slab(slabs(0.002)), {}),
 }
@@ -180,9 +182,13 @@ def test_a_block_slides_from_a_body_onto_a_box_in_float32(device):
     assert np.abs(out.spin).max() < 1e-3
 
 
-@pytest.mark.slow
-def test_a_block_slides_from_a_body_onto_a_rigid_part():
-    out = sliding(SEAMS["box behind, gap"][0], part=True)
+@pytest.mark.parametrize(
+    ("gap", "reverse"),
+    [(0.0, False), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((0.0, True), (0.002, True)))],
+)
+def test_a_block_slides_between_a_body_and_a_rigid_part(gap, reverse):
+    shapes = [slabs(gap)[0], boxes(gap)[1]] if not reverse else [boxes(gap)[0], slabs(gap)[1]]
+    out = sliding(shapes, part=True)
     assert out.velocity == pytest.approx([SPEED, 0.0, 0.0], abs=1e-9)
     assert np.abs(out.spin).max() < 1e-9
 

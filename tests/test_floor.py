@@ -54,7 +54,7 @@ def test_soft_directions_are_seen(rows, number):
 @pytest.mark.slow
 def test_the_table_is_what_is_found(rows):
     """Other machines round otherwise: outcomes near the bound may differ, the promise not."""
-    for row in [row for row in rows if row["stable"] is True][::8]:
+    for row in [row for row in rows if row["stable"] is True][::4]:
         assert_honest(tried({name: row[name] for name in GIVEN}, "cpu"))
 
 

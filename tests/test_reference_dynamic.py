@@ -141,8 +141,8 @@ def test_order_of_convergence(cantilever, data, integrator, hs, order, slack, ha
     ("integrator", "hs", "order", "slack", "halved"),
     [
         ("backward_euler", (1e-3, 1.25e-4), 1, 0.05, False),
-        ("bdf2", (5e-4, 6.25e-5), 2, 0.1, True),
-        ("energy_momentum", (5e-4, 6.25e-5), 2, 0.1, True),
+        ("bdf2", (5e-4, 3.125e-5), 2, 0.1, True),
+        ("energy_momentum", (5e-4, 3.125e-5), 2, 0.1, True),
     ],
 )
 def test_order_of_convergence_over_a_longer_time(cantilever, data, integrator, hs, order, slack, halved):
