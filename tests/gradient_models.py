@@ -95,3 +95,12 @@ def controls(kind, steps):
         "followers": {"pressure": 500.0 + 500.0 * ramp, "moment": 0.02 * rng.standard_normal((steps, 3))},
         "drives": {"shift": 0.01 * ramp * np.ones(3), "turn": 0.4 * ramp},
     }.get(kind, {})
+
+
+def bar(change=lambda b, box: None, law=LAW, gravity=(0, 0, -9.81)):
+    """A model of one bar of T4."""
+    b = wf.ModelBuilder(gravity=gravity)
+    box = b.add_solid(wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"), material=law, name="box")
+    change(b, box)
+    b.add_probe("tip", box.surface("x+"))
+    return b.finalize(device="cpu")
