@@ -15,14 +15,13 @@ from ..kernels.contact.adjoint import contact_adjoint_kernels, contact_adjoint_s
 from ..kernels.contact.structs import contact_scratch_struct, contact_struct
 from ..materials import DENSITY_CONSTANTS
 from ..model.contact_points import effective_modulus
-from ..terms.gradients import Gradient, StepAdjoint, with_fields
+from ..terms.gradients import FOUR_POINTS, Gradient, StepAdjoint, with_fields
 from ..terms.protocols import Differentiable
 from ..terms.term import StepContext, part
 from .tables import MATERIAL_CONSTANTS, POINT_SUM_LANES, bodies_of, contact_constants, restitution_slopes
 
 __all__ = ["ContactAdjoint", "DifferentiableColliders", "DifferentiableContact", "together"]
 
-POINTS, WEIGHTS = (-2.0, -1.0, 1.0, 2.0), (1.0 / 12.0, -2.0 / 3.0, 2.0 / 3.0, -1.0 / 12.0)
 RELATIVE_STEP = 1e-3
 """Four-point differences of the law's constants by those of materials, of which they are roots and quotients."""
 
@@ -247,8 +246,8 @@ class DifferentiableContact(Differentiable):
         """Derivatives of the constants of a contact in a world by a constant of some materials."""
         value = self.model.parameters.material_in_world(members[0][0], members[0][1], world).constants[name]
         step = RELATIVE_STEP * (abs(float(value)) or 1.0)
-        near = [self._shifted_constants(contact, members, name, world, k * step) for k in POINTS]
-        return {key: sum(w / step * np.asarray(at[key]) for w, at in zip(WEIGHTS, near)) for key in near[0]}
+        near = [self._shifted_constants(contact, members, name, world, k * step) for k, _ in FOUR_POINTS]
+        return {key: sum(w / step * np.asarray(at[key]) for (_, w), at in zip(FOUR_POINTS, near)) for key in near[0]}
 
     def _shifted_constants(
         self, contact: Any, members: list[Any], name: str, world: int, shift: float

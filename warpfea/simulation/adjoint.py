@@ -98,7 +98,7 @@ class Adjoint(Tape):
         check_names(self.stepper.initial_conditions, self.names)
         self.residual = self.growth = np.zeros(m.worlds)
         self._forward: Forward | None = None
-        self._sums = {name: self._zeros(self._size_of(name)) for name in self.names}
+        self._sums = {name: self.zeros(self.size_of(name)) for name in self.names}
         self._sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
         if self.static:
             self.kept += 2 * [self._snapshot() | {"status": wp.clone(self.sim.state.status)}]
@@ -163,7 +163,7 @@ class Adjoint(Tape):
             raise ModelError(f"Adjoint: {name!r} has no derivative; there are: {listing(known)}{hint}")
         return found
 
-    def _size_of(self, name: str) -> int:
+    def size_of(self, name: str) -> int:
         """Numbers of a parameter in a world and step."""
         bushings = [f"{b.name}.{field}" for b in self.model.description.bushings for field in ("stiffness", "damping")]
         return 6 if name in bushings else 3 if name == "gravity" else self.model.terms.time_laws.size_of(name)
@@ -194,7 +194,7 @@ class Adjoint(Tape):
         for array in sums.values():
             array.zero_()
         for name in (name for name in self.names if name in m.terms.time_laws.controls):
-            series[name] = self._zeros(self.steps, self._size_of(name))
+            series[name] = self.zeros(self.steps, self.size_of(name))
         last = np.zeros(m.worlds)
         add_probes = self._probe_commands()
         for k in reversed(range(self.steps)):
@@ -239,7 +239,7 @@ class Adjoint(Tape):
             ModelError: an unknown name, or a parameter, term or scheme without sensitivities, by name.
             ConvergenceError: a residual above 1e-6, in all worlds that run.
         """
-        if self._forward is None or self._forward.updates != self._updates:
+        if self._forward is None or self._forward.updates != self.updates:
             self._forward = Forward(self)
         found = self._forward.run(direction)
         self._check_result()
@@ -257,7 +257,7 @@ class Adjoint(Tape):
                 array.grad.zero_()
             loss.backward()
 
-    def _zeros(self, *shape: int) -> wp.array:
+    def zeros(self, *shape: int) -> wp.array:
         """Zeros [world, ...], float64."""
         return wp.zeros((self.model.worlds, *shape), dtype=wp.float64, device=self.model.device)
 

@@ -83,6 +83,13 @@ class ConsistentInitialConditions:
         """Evaluate the forces of the state, just after a jump there, before a step of size dt; (B, slots, 3), N."""
         return self._unbalanced_force(flags, self._discontinuities_at(self.ctx.state.time.numpy(), dt)[0], dt)
 
+    @property
+    def jerk_factors(self) -> tuple[float, float]:
+        """Parts of the jerk, over dt and dt^2, in accelerations, which belong to a time before, and in velocities."""
+        rho = self.integrator.parameter
+        early = (rho - 1.0) / (rho + 1.0)  # a_n belongs to the time t + early dt
+        return early, 1.0 / 6.0 - 1.0 / (rho + 1.0) ** 2 - 0.5 * early
+
     def begin_world(self, world: int) -> None:
         """Choose the world that is solved for."""
         self._forget_old_factors()
@@ -132,9 +139,7 @@ class ConsistentInitialConditions:
         set_rows(state.velocity, flags, v[flags])
         g = self._unbalanced_force(flags, after_jump, dt)
         w, a = np.zeros_like(v), np.zeros_like(v)
-        rho = self.integrator.parameter
-        early = (rho - 1.0) / (rho + 1.0)  # a_n belongs to the time t + early dt
-        late = 1.0 / 6.0 - 1.0 / (rho + 1.0) ** 2 - 0.5 * early
+        early, late = self.jerk_factors
         for world in np.flatnonzero(flags).tolist():
             self._world = world
             motion = u[world], v[world], laws[:, world]

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.worlds import set_rows
+from ..terms.gradients import COMPLEX_STEP
 from ..terms.protocols import Constrained, Differentiable
 from ..terms.shape_gradients import MESH
 from .consistent_initial_conditions import rates_of_vectors, right_sides, term_vectors
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     from .stepper import Stepper
 
 __all__ = ["check_initial_conditions", "check_names", "step_back_to_initial"]
-
-STEP = 1e-30
-"""Complex step."""
 
 
 def check_names(initial: Any, names: Iterable[str]) -> None:
@@ -77,9 +75,9 @@ class RowsOfWorld:
         for number, bar in enumerate(self.bars):
             for k in range(9):
                 near = [vector.astype(complex) for vector in self.vectors]
-                near[number].reshape(-1, 9)[:, k] += 1j * STEP
-                bar.reshape(-1, 9)[:, k] += work(*near, 0.0).imag / STEP
-        self.target_bar += work(*self.vectors, 1j * STEP).imag / STEP
+                near[number].reshape(-1, 9)[:, k] += 1j * COMPLEX_STEP
+                bar.reshape(-1, 9)[:, k] += work(*near, 0.0).imag / COMPLEX_STEP
+        self.target_bar += work(*self.vectors, 1j * COMPLEX_STEP).imag / COMPLEX_STEP
 
     def solve_work(self, y: np.ndarray, z: np.ndarray, x: np.ndarray, m: np.ndarray, right: Any) -> None:
         """Add -y.J^T m - z.J x + z.right of a solve; right(u, v, v1, w, targets)."""
@@ -122,6 +120,107 @@ class RowsOfWorld:
         return out
 
 
+class InitialSolves:
+    """The solves for the initial accelerations of some worlds, and their multipliers.
+
+    Attributes:
+        flags, chosen: of the worlds.
+        u, before, corrected, acceleration: (worlds, slots, 3); velocities before and after their correction.
+        first, jerk, first_bars, jerk_bars: solutions for velocities and jerk, and their multipliers y.
+        rows: bars of the rows by world. h: size of the step, s.
+    """
+
+    def __init__(self, stepper: Stepper, at: StepAdjoint, restart: tuple[np.ndarray, np.ndarray], h: float) -> None:
+        self.flags, self.before = restart
+        self.chosen, self.h = np.flatnonzero(self.flags).tolist(), h
+        self.stepper, self.at, self.model = stepper, at, stepper.model
+        self.start: Any = stepper.initial_conditions
+        self.prescribed = self.model.slot_table.free == 0.0
+        state: Any = stepper.state
+        self.u, self.acceleration = state.displacement.numpy().copy(), state.acceleration.numpy().copy()
+        self.first, self.jerk, self.first_bars, self.jerk_bars = (np.zeros_like(self.u) for _ in range(4))
+        self.laws = self.start.law_derivatives(self.flags, h)
+        self.corrected = self.before.copy()
+        self.multipliers: dict[int, tuple[Any, Any]] = {}
+        self.rows: dict[int, RowsOfWorld] = {}
+        self.zero = np.zeros((self.model.slots, 3))
+        self._correct_velocities()
+        set_rows(state.velocity, self.flags, self.corrected[self.flags])
+
+    def _correct_velocities(self) -> None:
+        for world in self.chosen:
+            self.start.begin_world(world)
+            own, v = self.laws[:, world], self.before[world]
+            J, rate, _ = self.start.constraint_rows(self.u[world], v, own)
+            jump = self.start.prescribed_rates(own)[0] - np.where(self.prescribed, v, 0.0)
+            self.first[world], m1 = self.start.solve_saddle_point(self.zero, jump, J, -rate)
+            self.corrected[world] += self.first[world]
+            self.multipliers[world] = J, m1
+
+    def step_back_accelerations(self, a_bar: np.ndarray, w_bar: np.ndarray, v_bar: np.ndarray) -> np.ndarray:
+        """Multipliers of the forces (worlds, slots, 3); adds to the bars of the corrected velocities."""
+        h, start = self.h, self.start
+        early, late = start.jerk_factors
+        g, tables, count = start.unbalanced_force(self.flags, h), self.model.constraints, self.model.slots
+        x = np.zeros_like(self.u)
+        for world in self.chosen:
+            start.begin_world(world)
+            own, J = self.laws[:, world], self.multipliers[world][0]
+            total, w = w_bar[world] + a_bar[world], self.acceleration[world]
+            if J is None:
+                x[world] = start.solve_saddle_point(total, self.zero)[0]
+                continue
+            motion = self.u[world], self.corrected[world], own
+            second = start.constraint_rows(*motion)[2]
+            m2 = start.solve_saddle_point(-g[world], start.prescribed_rates(own)[1], J, -second)[1]
+            self.jerk[world], m3 = start.solve_jerk(*motion, w, 0.25 * h)
+            fields = [self.u[world], self.before[world], self.corrected[world], w]
+            r = self.rows[world] = RowsOfWorld(tables, fields, own, 0.25 * h)
+            none = np.zeros(tables.count)
+            y, z = start.solve_saddle_point(early * h * a_bar[world] + late * h**2 * v_bar[world], self.zero, J, none)
+            self.jerk_bars[world] = y
+            r.solve_work(y, z, self.jerk[world], m3, r.jerk_side)
+            x[world], z = start.solve_saddle_point(total + r.slots(3, count), self.zero, J, none)
+            r.solve_work(x[world], z, w, m2, r.acceleration_side)
+            v_bar[world] += r.slots(2, count)
+        return x
+
+    def step_back_forces(self, x: np.ndarray, gradients: Any) -> None:
+        """Forces of the state, with its corrected velocities."""
+        solver, work, at = self.at.solver, self.stepper.work, self.at
+        set_rows(work.v_tilde, self.flags, (self.corrected - self.h * self.acceleration)[self.flags])
+        set_rows(solver.w, self.flags, x[self.flags])
+        work.step.running.assign(self.flags.astype(np.int32))
+        solver.mu.zero_()
+        solver.drive_bar.zero_()
+        solver.transpose(True)
+        if solver.constrained:
+            work.multipliers.penalty.zero_()
+        solver.subtract_start_force(at.active)
+        for term in self.model.terms.having(Differentiable):
+            term.add_history_gradient(at)
+        for add, out in gradients:
+            add(at, out)
+
+    def step_back_velocities(self, q_bar: np.ndarray, v_bar: np.ndarray) -> None:
+        """From the bars of the corrected velocities to those of the velocities before."""
+        start, count = self.start, self.model.slots
+        for world in self.chosen:
+            start.begin_world(world)
+            J, m1 = self.multipliers[world]
+            mass, target = self.model.masses.world_matrix(world), v_bar[world]
+            y, z = start.solve_saddle_point(target, self.zero, J, np.zeros(len(m1)))
+            self.first_bars[world] = y
+            impulse = mass @ y  # prescribed components were stopped by one on the others
+            if J is not None:
+                impulse = impulse + (J.T @ z).reshape(count, 3)
+                r = self.rows[world]
+                r.solve_work(y, z, self.first[world], m1, r.velocity_side)
+                q_bar[world] += r.slots(0, count)
+                v_bar[world] = target + r.slots(1, count)
+            v_bar[world] += np.where(self.prescribed, impulse - target, 0.0)
+
+
 def step_back_to_initial(
     stepper: Stepper, at: StepAdjoint, restart: tuple[np.ndarray, np.ndarray], h: float, gradients: Any,
     sums: Mapping[str, wp.array],
@@ -133,88 +232,22 @@ def step_back_to_initial(
         restart: flags (worlds,), and velocities before (worlds, slots, 3).
         gradients: functions of the parameters with their sums; sums: by name.
     """
-    s, w, solver, state, m = stepper, stepper.work, at.solver, stepper.state, stepper.model
-    start: Any = s.initial_conditions
-    flags, before = restart
-    chosen, count, tables = np.flatnonzero(flags).tolist(), m.slots, m.constraints
-    u, acceleration = state.displacement.numpy().copy(), state.acceleration.numpy().copy()  # type: ignore[attr-defined]
-    q_bar, v_bar = solver.q_bar.numpy().copy(), solver.v_bar.numpy().copy()
-    bars = [solver.bars[name] for name in s.integrator.history_arrays]
+    solver, flags = at.solver, restart[0]
+    solves = InitialSolves(stepper, at, restart, h)
+    bars = [solver.bars[name] for name in stepper.integrator.history_arrays]
     a_bar, w_bar = (bar.numpy().copy() for bar in bars)
-    early = (s.integrator.parameter - 1.0) / (s.integrator.parameter + 1.0)
-    late = 1.0 / 6.0 - 1.0 / (s.integrator.parameter + 1.0) ** 2 - 0.5 * early
-    laws = start.law_derivatives(flags, h)
-    corrected, zero = before.copy(), np.zeros((count, 3))
-    x, rows, prescribed = np.zeros_like(u), {}, m.slot_table.free == 0.0
-    first, jerk = np.zeros_like(u), np.zeros_like(u)
-    jerk_bars = np.zeros_like(u)
-    multipliers = {}
-    for world in chosen:
-        start.begin_world(world)
-        own = laws[:, world]
-        J, rate, _ = start.constraint_rows(u[world], before[world], own)
-        jump = start.prescribed_rates(own)[0] - np.where(prescribed, before[world], 0.0)
-        first[world], m1 = start.solve_saddle_point(zero, jump, J, -rate)
-        corrected[world] += first[world]
-        multipliers[world] = J, m1
-    set_rows(state.velocity, flags, corrected[flags])
-    g = start.unbalanced_force(flags, h)
-    for world in chosen:
-        start.begin_world(world)
-        own, J = laws[:, world], multipliers[world][0]
-        total = w_bar[world] + a_bar[world]
-        if J is None:
-            x[world] = start.solve_saddle_point(total, zero)[0]
-            continue
-        motion = u[world], corrected[world], own
-        second = start.constraint_rows(*motion)[2]
-        m2 = start.solve_saddle_point(-g[world], start.prescribed_rates(own)[1], J, -second)[1]
-        jerk[world], m3 = start.solve_jerk(*motion, acceleration[world], 0.25 * h)
-        r = rows[world] = RowsOfWorld(tables, [u[world], before[world], corrected[world], acceleration[world]], own,
-                                      0.25 * h)  # fmt: skip
-        none = np.zeros(tables.count)
-        y, z = start.solve_saddle_point(early * h * a_bar[world] + late * h**2 * v_bar[world], zero, J, none)
-        jerk_bars[world] = y
-        r.solve_work(y, z, jerk[world], m3, r.jerk_side)
-        x[world], z = start.solve_saddle_point(total + r.slots(3, count), zero, J, none)
-        r.solve_work(x[world], z, acceleration[world], m2, r.acceleration_side)
-        v_bar[world] += r.slots(2, count)
-    # forces of the state, with its corrected velocities
-    set_rows(w.v_tilde, flags, (corrected - h * acceleration)[flags])
-    for array, values in ((solver.w, x), (solver.v_bar, v_bar), *((bar, np.zeros_like(x)) for bar in bars)):
+    v_bar = solver.v_bar.numpy().copy()
+    x = solves.step_back_accelerations(a_bar, w_bar, v_bar)
+    for array, values in ((solver.v_bar, v_bar), *((bar, np.zeros_like(x)) for bar in bars)):
         set_rows(array, flags, values[flags])
-    w.step.running.assign(flags.astype(np.int32))
-    solver.mu.zero_()
-    solver.drive_bar.zero_()
-    solver._transpose(True)
-    if solver.constrained:
-        w.multipliers.penalty.zero_()
-    solver.operator.product(solver.w, w.Hp, at.active, solver.topology, start=True)
-    s.launch(solver.kernels.subtract_force, solver.dim, [w.Hp, w.step.dq_dv, at.active, solver.q_bar])
-    for term in m.terms.having(Differentiable):
-        term.add_history_gradient(at)
-    for add, out in gradients:
-        add(at, out)
+    solves.step_back_forces(x, gradients)
     q_bar, v_bar = solver.q_bar.numpy().copy(), solver.v_bar.numpy().copy()
-    first_bars = np.zeros_like(u)
-    for world in chosen:
-        start.begin_world(world)
-        J, m1 = multipliers[world]
-        mass, target = m.masses.world_matrix(world), v_bar[world]
-        y, z = start.solve_saddle_point(target, zero, J, np.zeros(len(m1)))
-        first_bars[world] = y
-        impulse = mass @ y  # prescribed components were stopped by one on the others
-        if J is not None:
-            impulse = impulse + (J.T @ z).reshape(count, 3)
-            r = rows[world]
-            r.solve_work(y, z, first[world], m1, r.velocity_side)
-            q_bar[world] += r.slots(0, count)
-            v_bar[world] = target + r.slots(1, count)
-        v_bar[world] += np.where(prescribed, impulse - target, 0.0)
+    solves.step_back_velocities(q_bar, v_bar)
     for array, values in ((solver.q_bar, q_bar), (solver.v_bar, v_bar)):
         set_rows(array, flags, values[flags])
-    _add_inertia(s, at, flags, h, gradients, ((first, first_bars), (jerk, jerk_bars)))
-    _add_targets(m, rows, sums)
+    pairs = ((solves.first, solves.first_bars), (solves.jerk, solves.jerk_bars))
+    _add_inertia(stepper, at, flags, h, gradients, pairs)
+    _add_targets(stepper.model, solves.rows, sums)
 
 
 def _add_inertia(s: Stepper, at: StepAdjoint, flags: np.ndarray, h: float, gradients: Any, solves: Any) -> None:

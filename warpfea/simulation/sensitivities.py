@@ -40,8 +40,8 @@ class Forward:
         for name, found in self.gradients.items():
             if not all(hasattr(gradient, "change") for gradient in found):
                 raise ModelError(f"Adjoint.forward: {name!r} has no sensitivity; take backward()")
-        self.changes = {name: tape._zeros(tape._size_of(name)) for name, found in self.gradients.items() if found}
-        self.updates = tape._updates
+        self.changes = {name: tape.zeros(tape.size_of(name)) for name, found in self.gradients.items() if found}
+        self.updates = tape.updates
         self.graph: wp.Graph | None = None
 
     def run(self, direction: Mapping[str, Any]) -> dict[str, ProbeArrays]:
@@ -75,7 +75,7 @@ class Forward:
         for name in tape.names:
             laws = name in m.terms.time_laws.controls and not tape.static
             shape: tuple[int, ...] = (m.worlds, tape.steps) if laws else (m.worlds,)
-            shape = (m.worlds, m.slots, 3) if name not in self.changes else (*shape, tape._size_of(name))
+            shape = (m.worlds, m.slots, 3) if name not in self.changes else (*shape, tape.size_of(name))
             given = direction.get(name, 0.0)
             values = np.asarray(given.numpy() if hasattr(given, "numpy") else given, dtype=float)
             if name in self.changes and shape[-1] == 1 and values.ndim == len(shape) - 1:

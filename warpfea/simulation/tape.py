@@ -76,7 +76,7 @@ class Tape:
         self.sim, self.model, self.budget, self.folder = sim, sim.model, budget, folder
         self.probes: dict[str, ProbeArrays] = {}
         self.clear()
-        self._updates = self.model.terms.parameter_updates
+        self.updates = self.model.terms.parameter_updates
         self._graph: wp.Graph | None = None  # of a step back, with the derivatives of the coefficients at hand
 
     @property
@@ -102,8 +102,8 @@ class Tape:
             self.clear()
         self._check_state()
         self.kept.expect(steps)
-        if not self.kept and self._updates != self.model.terms.parameter_updates:
-            self._updates, self._graph = self.model.terms.parameter_updates, None
+        if not self.kept and self.updates != self.model.terms.parameter_updates:
+            self.updates, self._graph = self.model.terms.parameter_updates, None
         self._check_parameters()
         with convert_memory_errors(f"a tape of {steps} steps", self.model.device):
             if not self.kept:
@@ -180,7 +180,7 @@ class Tape:
         return self.kept.recomputed
 
     def _check_parameters(self) -> None:
-        if self.model.terms.parameter_updates != self._updates:
+        if self.model.terms.parameter_updates != self.updates:
             raise ModelError("Adjoint: parameters were set after the first step of the tape; reset the simulation")
 
     def _check_state(self) -> None:

@@ -138,17 +138,22 @@ class AdjointSolver:
     @launch_part("vectors")
     def solve(self) -> None:
         """Solve at the linearised step, and step back."""
-        m, w, launch, k = self.model, self.work, self.launch, self.kernels
+        m, w, launch = self.model, self.work, self.launch
         active, step = self.running, w.step
-        self._transpose(True)
+        self.transpose(True)
         launch(self.step_kernels.right_side, self.dim, [step, *self.state_bars, active, self.rhs, self.w])
         w.Hp.zero_()
         self._solve_system()
         args = [step, m.topology, self.driven, self.w, w.gradient, active, *self.state_bars, self.drive_bar]
         launch(self.step_kernels.step_back, self.dim, args)
         if self.newton.ctx.midpoint:
-            self.operator.product(self.w, w.Hp, active, self.topology, start=True)
-            launch(k.subtract_force, self.dim, [w.Hp, step.dq_dv, active, self.q_bar])
+            self.subtract_start_force(active)
+
+    def subtract_start_force(self, active: wp.array) -> None:
+        """Subtract from q_bar what w gives by the forces' derivatives at the start of the step."""
+        w = self.work
+        self.operator.product(self.w, w.Hp, active, self.topology, start=True)
+        self.launch(self.kernels.subtract_force, self.dim, [w.Hp, w.step.dq_dv, active, self.q_bar])
 
     @launch_part("vectors")
     def step_forward(self, parameters: Callable[[], None], histories: Callable[[], None]) -> None:
@@ -158,7 +163,7 @@ class AdjointSolver:
         """
         m, w, launch, k, step = self.model, self.work, self.launch, self.step_kernels, self.work.step
         active = self.running
-        self._transpose(False)
+        self.transpose(False)
         for array in (self.force, self.drive):
             array.zero_()
         parameters()
@@ -183,7 +188,7 @@ class AdjointSolver:
             self.force, self.q_tilde, self.v_tilde, self.predicted = arrays
             self.drive = self.drive_bar
 
-    def _transpose(self, transposed: bool) -> None:
+    def transpose(self, transposed: bool) -> None:
         """Take the operator and the rows of constraints, or their transposes."""
         mul = self.work.multipliers
         self.operator.transposed, self.multipliers = transposed, mul

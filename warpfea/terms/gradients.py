@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from .term import StepContext
 
 __all__ = [
+    "COMPLEX_STEP",
+    "FOUR_POINTS",
     "ForceGradient",
     "Gradient",
     "StepAdjoint",
@@ -42,8 +44,10 @@ __all__ = [
     "with_fields",
 ]
 
-STEP = 1e-30
-"""Complex step: derivatives are exact to round-off for any small one."""
+COMPLEX_STEP = 1e-30
+"""Derivatives are exact to round-off for any small one."""
+FOUR_POINTS = tuple(zip((-2.0, -1.0, 1.0, 2.0), (1.0 / 12.0, -2.0 / 3.0, 2.0 / 3.0, -1.0 / 12.0)))
+"""Points and weights of central differences of fourth order."""
 
 
 @dataclass(eq=False)
@@ -223,7 +227,7 @@ def constant_gradient(ctx: StepContext, elements: Any, members: list[Any], name:
                 material = _shifted(m.parameters.material_of_worlds(part.body, part.material), name)
                 _, values = assembly.law_and_coefficients(part.key.integral, material)
                 rows = assembly.coefficient_rows(values, material, worlds, complex)
-                table[:, part.coefficient_row] = rows.imag / STEP
+                table[:, part.coefficient_row] = rows.imag / COMPLEX_STEP
     coefficients: wp.array = wp.array(table, dtype=m.types.T, device=m.device)
     kernels = dict(zip(map(id, m.blocks), elements.kernels(ctx)))
     passes = [[(block, {"coefficients": coefficients}) for block in chosen]]
@@ -248,7 +252,7 @@ def constant_gradient(ctx: StepContext, elements: Any, members: list[Any], name:
 
 def _shifted(material: Any, name: str) -> Any:
     """The material with a complex step of a constant."""
-    return material.with_constants({name: material.constants[name] + 1j * STEP})
+    return material.with_constants({name: material.constants[name] + 1j * COMPLEX_STEP})
 
 
 def _block_data(ctx: StepContext, block: Any, changes: dict[str, Any]) -> Any:
@@ -267,8 +271,8 @@ def _coupling_derivative(m: Model, block: Any, members: list[Any], name: str) ->
         material = m.parameters.material_of_worlds(part.body, part.material)
         values, of_world = np.unique(np.broadcast_to(material.constants[name], (worlds,)), return_inverse=True)
         plain = part.body.materials[part.material][1]
-        shifted = [plain.with_constants({name: float(value) + 1j * STEP}) for value in values]
-        tables.append((couplings(part, shifted).imag / STEP)[of_world])
+        shifted = [plain.with_constants({name: float(value) + 1j * COMPLEX_STEP}) for value in values]
+        tables.append((couplings(part, shifted).imag / COMPLEX_STEP)[of_world])
     table = np.concatenate(tables, axis=1)
     values = np.moveaxis(table.reshape(-1, *table.shape[2:]), 0, 2)
     return wp.array(np.ascontiguousarray(values), dtype=m.types.T, device=m.device)

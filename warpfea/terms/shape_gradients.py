@@ -20,7 +20,7 @@ from ..kernels.terms.shape_gradients import shape_kernels
 from ..model import assembly
 from ..model.blocks import tangent_damping
 from ..model.masses import has_constant_density
-from .gradients import Gradient, StepAdjoint, compile_kernels, with_fields
+from .gradients import FOUR_POINTS, Gradient, StepAdjoint, compile_kernels, with_fields
 
 if TYPE_CHECKING:
     from ..model.blocks import Block
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["MESH", "MeshGradient", "internal_force_gradient", "mass_gradient", "not_shaped", "traction_gradient"]
 
 MESH = "mesh.X"
-POINTS, WEIGHTS = (-2.0, -1.0, 1.0, 2.0), np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
 RELATIVE_STEP = 1e-3
 """Change of J0 in differences of fourth order of the couplings of assumed strains: both errors are near 1e-13."""
 
@@ -194,7 +193,7 @@ def _coupling_gradients(host: Any, members: np.ndarray, ds: np.ndarray, J: np.nd
         both = np.concatenate([ds[:, :, i], ds_rule[:, :, i]], axis=1)
         step = RELATIVE_STEP / np.max(np.abs(both).max(axis=1) / size, axis=1)
         for c in range(3):
-            for point, weight in zip(POINTS, WEIGHTS):
+            for point, weight in FOUR_POINTS:
                 shifted = [J.copy(), J_rule.copy()]
                 for table, change in zip(shifted, (ds, ds_rule)):
                     table[:, :, c] += (point * step)[:, None, None] * change[:, :, i]
