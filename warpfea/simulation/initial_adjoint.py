@@ -134,7 +134,8 @@ class InitialSolves:
         self.flags, self.before = restart
         self.chosen, self.h = np.flatnonzero(self.flags).tolist(), h
         self.stepper, self.at, self.model = stepper, at, stepper.model
-        self.start: Any = stepper.initial_conditions
+        assert stepper.initial_conditions is not None
+        self.start = stepper.initial_conditions
         self.prescribed = self.model.slot_table.free == 0.0
         state: Any = stepper.state
         self.u, self.acceleration = state.displacement.numpy().copy(), state.acceleration.numpy().copy()
