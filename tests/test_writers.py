@@ -85,7 +85,6 @@ def test_two_outputs_of_one_file_and_names_too_long_for_it(tmp_path, monkeypatch
                 make(tmp_path / "a", fields=fields)
 
 
-@pytest.mark.xfail(strict=True, reason="to be measured on the H200")
 def test_price_of_writers():
     """600 steps of 883k unknowns with the von Mises stress at 60 frames, in a page or in USD: 1.2 of those without."""
     content = content_of("writers_h200.json", "python tests/writers_price.py", "cuda")
