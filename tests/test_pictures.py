@@ -13,6 +13,7 @@ from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.animation import to_palette
 from warpfea.outputs.colormap import map_colors, to_linear
 from warpfea.outputs.normals import smooth_corners
+from warpfea.outputs.pixels import rasterize
 from warpfea.outputs.raycaster import Camera, Renderer, nice_number
 from warpfea.outputs.render import GIFWriter, PNGWriter
 from warpfea.outputs.vtk import VTUWriter
@@ -143,6 +144,36 @@ def test_renderer_far_from_the_origin():
         assert (refitted == renderer_pictures(renderers[1], [bent], colors, camera)[0]).all()
     with pytest.raises(OutputError, match="finite"):
         Renderer(triangles).render(points * np.nan, colors)
+
+
+def test_rasterized_faces_are_those_that_rays_meet():
+    """Nearest of triangles at samples by their weights; a picture by it is that of rays, which sections need."""
+    import warp as wp
+
+    from warpfea.kernels.outputs import raycast
+
+    random = np.random.default_rng(0)
+    corners, triangles = random.uniform((-3, -2, 0), (15, 12, 1), (90, 3)), np.arange(90).reshape(-1, 3)
+    cells, offsets = random.random((10, 12)) < 0.7, np.array([[0.1, 0.9], [0.5, 0.5]])
+    found = rasterize(wp, raycast, corners, triangles, cells, offsets)
+    rows, columns = np.nonzero(cells)
+    at = np.stack([columns, rows], axis=1)[:, None] + offsets
+    best, faces = np.zeros(at.shape[:2]), np.full(at.shape[:2], -1)
+    for k, corner in enumerate(corners[triangles]):
+        weights = np.linalg.solve(
+            np.vstack([corner[:, :2].T, np.ones(3)]), np.dstack([at, np.ones(best.shape)])[..., None]
+        )
+        depth = np.where((weights >= 0.0).all(axis=(2, 3)), weights[..., 0] @ corner[:, 2], -1.0)
+        best, faces = np.maximum(best, depth), np.where(depth > best, k, faces)
+    assert (found == faces).all()
+    assert (faces < 0).any()
+    points, _, surface = tet_box((1.0, 0.2, 0.2), (8, 2, 2))
+    pictures = [
+        Renderer(surface, ground=-0.3, cut=cut).render(points, map_colors(points[:, 0], 0.0, 1.0)).astype(int)
+        for cut in (None, np.array([1.0, 0.0, 0.0, 9.0]))
+    ]
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2
+    assert (pictures[0] != pictures[1]).mean() < 1e-3
 
 
 def test_renderer_turns_y_up():

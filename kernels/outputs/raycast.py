@@ -9,6 +9,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 MAX_LAYERS = wp.constant(200)
 """Bound of the surfaces that a ray goes through: cut away, or transparent."""
+PIXELS = wp.constant(64)
 GRID = wp.constant(8)
 """Bit of `Scene.sides`."""
 
@@ -137,13 +138,13 @@ def side_shade(scene: Scene, face: int, p: wp.vec3, distance: float):
 
 
 @wp.func
-def grid_shade(scene: Scene, hit: wp.MeshQueryRay, distance: float, facing: float):
+def grid_shade(scene: Scene, face: int, weights: wp.vec3, distance: float, facing: float):
     """Share of black of a grid fixed to a surface: lines at round coordinates of its reference points."""
-    k, w = 3 * hit.face, 1.0 - hit.u - hit.v
+    k = 3 * face
     a = scene.reference[wp.mesh_get_index(scene.mesh, k)]
     b = scene.reference[wp.mesh_get_index(scene.mesh, k + 1)]
     c = scene.reference[wp.mesh_get_index(scene.mesh, k + 2)]
-    at = a * hit.u + b * hit.v + c * w
+    at = a * weights[0] + b * weights[1] + c * weights[2]
     n = wp.cross(b - a, c - a)
     x, y = at[1], at[2]  # the coordinates along the face
     if wp.abs(n[1]) > wp.abs(n[0]) and wp.abs(n[1]) >= wp.abs(n[2]):
@@ -157,78 +158,163 @@ def grid_shade(scene: Scene, hit: wp.MeshQueryRay, distance: float, facing: floa
 
 
 @wp.func
-def surface_color(scene: Scene, hit: wp.MeshQueryRay, p: wp.vec3, distance: float, ray: wp.vec3):
-    """Colour of the surface that a ray meets at p, with its lines."""
-    k, w = 3 * hit.face, 1.0 - hit.u - hit.v
-    n = scene.corner_normals[k] * hit.u + scene.corner_normals[k + 1] * hit.v + scene.corner_normals[k + 2] * w
-    albedo = (
-        scene.colors[wp.mesh_get_index(scene.mesh, k)] * hit.u
-        + scene.colors[wp.mesh_get_index(scene.mesh, k + 1)] * hit.v
-        + scene.colors[wp.mesh_get_index(scene.mesh, k + 2)] * w
-    )
+def surface_color(scene: Scene, face: int, weights: wp.vec3, p: wp.vec3, distance: float, ray: wp.vec3):
+    """Colour of the surface that a ray meets at p, with its lines; `weights` are of the corners of the face."""
+    k = 3 * face
+    n, albedo = wp.vec3(0.0), wp.vec3(0.0)
+    for i in range(3):
+        n += scene.corner_normals[k + i] * weights[i]
+        albedo += scene.colors[wp.mesh_get_index(scene.mesh, k + i)] * weights[i]
     n = wp.normalize(n)
-    flat = wp.normalize(hit.normal)
+    flat = wp.mesh_eval_face_normal(scene.mesh, face)
     if wp.dot(flat, ray) > 0.0:
         flat = -flat
     if wp.dot(n, flat) < 0.0:
         n = -n
     color = shade_surface(scene, p, n, flat, albedo, ray)
     if scene.sides.shape[0] > 0:
-        color = color * (1.0 - side_shade(scene, hit.face, p, distance))
-        if scene.sides[hit.face] & GRID != 0:
-            color = color * (1.0 - grid_shade(scene, hit, distance, -wp.dot(flat, ray)))
+        color = color * (1.0 - side_shade(scene, face, p, distance))
+        if scene.sides[face] & GRID != 0:
+            color = color * (1.0 - grid_shade(scene, face, weights, distance, -wp.dot(flat, ray)))
     return color
 
 
-@wp.kernel
-def cast_rays(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec3)):
-    """Colour (linear light) of each picture position (pixels, y down)."""
-    sample = wp.tid()
-    x = 2.0 * samples[sample][0] / scene.width_pixels - 1.0 - scene.principal_point[0]
-    y = 1.0 - 2.0 * samples[sample][1] / scene.height_pixels - scene.principal_point[1]
+@wp.func
+def meet_face(scene: Scene, face: int, ray: wp.vec3):
+    """Weights of the corners of a face where a ray from the eye meets it."""
+    a = wp.mesh_get_point(scene.mesh, 3 * face) - scene.eye
+    b = wp.mesh_get_point(scene.mesh, 3 * face + 1) - scene.eye
+    c = wp.mesh_get_point(scene.mesh, 3 * face + 2) - scene.eye
+    volumes = wp.vec3(wp.dot(ray, wp.cross(b, c)), wp.dot(ray, wp.cross(c, a)), wp.dot(ray, wp.cross(a, b)))
+    total = volumes[0] + volumes[1] + volumes[2]
+    u, v = wp.clamp(volumes[0] / total, 0.0, 1.0), wp.clamp(volumes[1] / total, 0.0, 1.0)
+    return wp.vec3(u, v, 1.0 - u - v)
+
+
+@wp.func
+def sample_color(scene: Scene, at: wp.vec2, first_known: bool, first: int):
+    """Colour (linear light) of a place of the picture (pixels, y down); `first`, where known: the face that its ray
+    meets before others, -1 for none."""
+    x = 2.0 * at[0] / scene.width_pixels - 1.0 - scene.principal_point[0]
+    y = 1.0 - 2.0 * at[1] / scene.height_pixels - scene.principal_point[1]
     ray = wp.normalize(scene.forward + scene.right * x + scene.up * y)
-    color = background_color(1.0 - samples[sample][1] / scene.height_pixels)
+    color = background_color(1.0 - at[1] / scene.height_pixels)
     reach = float(1.0e4)
     if scene.has_ground == 1 and ray[2] < -1.0e-4:
         reach = (scene.ground_height - scene.eye[2]) / ray[2]
-        p = scene.eye + ray * reach
-        color = shade_ground(scene, p, reach, -ray[2], color)
     behind = float(1.0)  # share of the light from behind the surfaces met so far
     seen = wp.vec3(0.0, 0.0, 0.0)
     depth = float(reach)
     start = float(0.0)
-    for _ in range(MAX_LAYERS):
-        hit = wp.mesh_query_ray(scene.mesh, scene.eye + ray * start, ray, reach - start)
-        if not hit.result or behind < 0.01:
+    for layer in range(MAX_LAYERS):
+        if behind < 0.01:
             break
-        start += hit.t
+        face = wp.int32(-1)
+        weights = wp.vec3(0.0)
+        if layer == 0 and first_known:
+            face = first
+            if face >= 0:
+                weights = meet_face(scene, face, ray)
+                start = wp.dot(wp.mesh_eval_position(scene.mesh, face, weights[0], weights[1]) - scene.eye, ray)
+        else:
+            hit = wp.mesh_query_ray(scene.mesh, scene.eye + ray * start, ray, reach - start)
+            if hit.result:
+                face = hit.face
+                weights = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+                start += hit.t
+        if face < 0 or start > reach:
+            break
         p = scene.eye + ray * start
         if scene.has_cut == 0 or p[0] * scene.cut[0] + p[1] * scene.cut[1] + p[2] * scene.cut[2] <= scene.cut[3]:
             share = behind
             if scene.opacity.shape[0] > 0:
-                share = behind * scene.opacity[hit.face]
-            seen += share * surface_color(scene, hit, p, start, ray)
+                share = behind * scene.opacity[face]
+            seen += share * surface_color(scene, face, weights, p, start, ray)
             behind -= share
             depth = wp.min(depth, start)
         start += 1.0e-5
+    if reach < 1.0e4 and behind > 0.0:
+        color = shade_ground(scene, scene.eye + ray * reach, reach, -ray[2], color)
     color = seen + behind * color
     if scene.has_ghost == 1:
         before = wp.mesh_query_ray(scene.ghost, scene.eye, ray, depth)
         if before.result:
             facing = wp.abs(wp.dot(wp.normalize(before.normal), ray))
             color = blend(color, wp.vec3(0.30, 0.34, 0.42) * (0.4 + 0.6 * facing), 0.35)
-    out[sample] = color
+    return color
 
 
 @wp.kernel
-def cast_shadow(scene: Scene, lights: wp.array(dtype=wp.vec3), shadow: wp.array2d(dtype=float)):
-    """Shadow map: fraction of the directions `lights` in which a cell of the ground meets no surface."""
-    i, j = wp.tid()
-    x = scene.shadow_map_corner[0] + (float(i) + 0.5) * scene.shadow_cell_size
-    y = scene.shadow_map_corner[1] + (float(j) + 0.5) * scene.shadow_cell_size
-    start = wp.vec3(x, y, scene.ground_height)
-    seen = float(0.0)
-    for k in range(lights.shape[0]):
-        if not wp.mesh_query_ray_anyhit(scene.blocker, start, lights[k], 20.0):
-            seen += 1.0
-    shadow[i, j] = seen / float(lights.shape[0])
+def cast_rays(
+    scene: Scene,
+    pixels: wp.array(dtype=wp.vec2i),  # column, row
+    places: wp.array(dtype=wp.vec2),  # of the samples in each pixel, 0 .. 1
+    faces: wp.array2d(dtype=wp.int32),  # [pixel, sample] first face met, -1 for none; or empty, not known
+    out: wp.array(dtype=wp.vec3),
+):
+    """Mean colour (linear light) of the samples of each pixel; a thread takes PIXELS of them, as the scene is copied
+    for each."""
+    first_pixel = wp.tid() * PIXELS
+    known = faces.shape[0] > 0
+    for pixel in range(first_pixel, wp.min(first_pixel + PIXELS, pixels.shape[0])):
+        corner = wp.vec2(float(pixels[pixel][0]), float(pixels[pixel][1]))
+        color = wp.vec3(0.0)
+        for k in range(places.shape[0]):
+            first = wp.int32(-1)
+            if known:
+                first = faces[pixel, k]
+            color += sample_color(scene, corner + places[k], known, first)
+        out[pixel] = color / float(places.shape[0])
+
+
+@wp.func
+def side_of(a: wp.vec3d, b: wp.vec3d, area: wp.float64):
+    """Coefficients of 1, x and y of the weight of a corner of a triangle, from its two others."""
+    return wp.vec3d(a[0] * b[1] - a[1] * b[0], a[1] - b[1], b[0] - a[0]) / area
+
+
+@wp.kernel
+def rasterize(
+    corners: wp.array(dtype=wp.vec3d),  # [vertex] x, y in cells; what grows towards the viewer
+    triangles: wp.array2d(dtype=wp.int32),
+    slots: wp.array2d(dtype=wp.int32),  # [row, column] first index of `faces` for a cell; -1: not asked for
+    places: wp.array(dtype=wp.vec2d),  # of the samples in each cell, 0 .. 1
+    nearest: wp.array2d(dtype=wp.float64),
+    faces: wp.array2d(dtype=wp.int32),
+):
+    """Triangle next to the viewer in each sample; threads must run one after the other, as on the CPU."""
+    face = wp.tid()
+    a, b, c = corners[triangles[face, 0]], corners[triangles[face, 1]], corners[triangles[face, 2]]
+    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    if area == wp.float64(0.0):
+        return
+    low, high = wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c))
+    size = wp.vec2d(wp.float64(slots.shape[1]), wp.float64(slots.shape[0]))
+    zero, one, slack = wp.float64(0.0), wp.float64(1.0), wp.float64(-1.0e-7)
+    first_row, last_row = int(wp.clamp(low[1], zero, size[1])), int(wp.clamp(high[1] + one, zero, size[1]))
+    left, right = wp.clamp(low[0], zero, size[0]), wp.clamp(high[0] + one, zero, size[0])
+    fa, fb, fc = side_of(b, c, area), side_of(c, a, area), side_of(a, b, area)
+    near = fa * a[2] + fb * b[2] + fc * c[2]
+    for row in range(first_row, last_row):
+        first, last = left, right  # columns of the cells that the triangle meets in this row
+        for side in range(3):
+            f = fa
+            if side == 1:
+                f = fb
+            if side == 2:
+                f = fc
+            most = f[0] + wp.max(f[2] * wp.float64(row), f[2] * wp.float64(row + 1)) - slack
+            if f[1] > zero:
+                first = wp.max(first, -most / f[1] - one)
+            if f[1] < zero:
+                last = wp.min(last, -most / f[1] + one)
+        for column in range(int(first), int(last)):
+            slot = slots[row, column]
+            if slot >= 0:
+                for k in range(places.shape[0]):
+                    at = wp.vec3d(one, wp.float64(column) + places[k][0], wp.float64(row) + places[k][1])
+                    if wp.dot(fa, at) >= slack and wp.dot(fb, at) >= slack and wp.dot(fc, at) >= slack:
+                        z = wp.dot(near, at)
+                        if z > nearest[slot, k]:
+                            nearest[slot, k] = z
+                            faces[slot, k] = face

@@ -1,5 +1,6 @@
 """Writing over a picture: time, colour bar, marks of supports and joints, axes, names, extremes."""
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +29,11 @@ _MARK_COLORS = {
 _AXIS_COLORS = ((195, 51, 51), (42, 143, 42), (51, 102, 204))
 
 
+@functools.lru_cache(maxsize=8)
+def _font(size: float) -> Any:
+    return pillow.ImageFont.load_default(size)
+
+
 @dataclass
 class Overlay:
     """Marks of one frame, at points (n, 3) in the frame with z up.
@@ -45,7 +51,7 @@ class Overlay:
     def draw(self, draw: Any, camera: Camera, size: tuple[int, int]) -> None:
         """Draw onto a picture by PIL."""
         unit = size[1] / 90.0
-        font = pillow.ImageFont.load_default(max(9.0, size[1] / 38))
+        font = _font(max(9.0, size[1] / 38))
         springs = [camera.project(point, size) for kind, point in self.marks if kind == "spring"]
         for first, second in zip(springs[::2], springs[1::2]):
             draw.line([*first, *second], fill=_MARK_COLORS["spring"], width=max(1, round(0.4 * unit)))
@@ -95,8 +101,8 @@ def draw_labels(
     draw = pillow.ImageDraw.Draw(picture)
     if overlay is not None and camera is not None:
         overlay.draw(draw, camera, (width, height))
-    font = pillow.ImageFont.load_default(max(10.0, height / 30))
-    small = pillow.ImageFont.load_default(max(9.0, height / 36))
+    font = _font(max(10.0, height / 30))
+    small = _font(max(9.0, height / 36))
     line = 1.25 * height / 30
     draw.text((0.025 * width, height - 1.6 * line), time, fill=_TEXT_COLOR, font=font)
     if bar is None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import functools
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,13 +12,13 @@ import numpy.typing as npt
 from ..base.checks import number_pair
 from ..base.console import quiet_warp
 from ..base.errors import ModelError, OutputError
-from .colormap import to_linear, to_srgb
+from .colormap import to_linear
 from .normals import CornerNormals, smooth_corners, unit_rows
+from .pixels import MIDDLE, SUBPIXELS, Image, cast_pixels, edge_pixels, grown, pixels_of, rasterize, to_bytes
 
-__all__ = ["DEFAULT_VIEW", "Camera", "Renderer", "check_view", "nice_number", "to_z_up"]
+__all__ = ["DEFAULT_VIEW", "Camera", "Image", "Renderer", "check_view", "nice_number", "to_z_up"]
 
 Floats = npt.NDArray[np.floating[Any]]
-Image = npt.NDArray[np.uint8]
 DEFAULT_VIEW = (-65.0, 20.0)  # default azimuth, elevation (degrees)
 
 
@@ -59,6 +57,15 @@ class Camera:
         x = float(local @ right) / (tangent * size[0] / size[1]) + self.center[0]
         y = float(local @ up) / tangent + self.center[1]
         return 0.5 * (x + 1.0) * size[0], 0.5 * (1.0 - y) * size[1]
+
+    def pixels(self, points: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Pixels (n, 2) as of `project`, and depths (n,) in m, of points (n, 3); for positive depths only."""
+        forward, right, up = self.axes()
+        local = (points - self.eye) @ np.stack([right, up, forward], axis=1)
+        depth = np.where(local[:, 2] > 0.0, local[:, 2], 1.0)
+        tangent = np.tan(np.radians(0.5 * self.fov)) * np.array([size[0] / size[1], -1.0])
+        place = local[:, :2] / depth[:, None] / tangent + np.array(self.center) * (1.0, -1.0)
+        return (0.5 + 0.5 * place) * size, local[:, 2]
 
     @classmethod
     def framing(
@@ -161,7 +168,7 @@ class Renderer:
         self._normals: tuple[npt.NDArray[np.int64], CornerNormals] | None = None
         self._mesh: Any = None
         self._seen: tuple[float, ...] = ()
-        self._backdrop: Image | None = None
+        self._backdrop: tuple[Image, Image] | None = None
         self._shadow_corners = np.zeros((0, 3))
         self._sides = np.zeros(0, dtype=np.int32) if edges is None else side_bits(self.triangles, edges)
         if gridded is not None:
@@ -194,57 +201,63 @@ class Renderer:
         unit = (points - camera.target) / camera.size
         with quiet_warp(), wp.ScopedDevice("cpu"):
             scene = self._make_scene(wp, raycast, unit, np.asarray(colors), camera, size)
-            self._cast_shadow(wp, raycast, scene, unit)
-            if scene.has_ground:
-                low = np.array(scene.shadow_map_corner)
-                high = low + scene.shadow_cell_size * np.array(scene.shadow_map.shape)
-                corners = [(x, y, scene.ground_height) for x in (low[0], high[0]) for y in (low[1], high[1])]
-                self._shadow_corners = camera.target + camera.size * np.array(corners)
-            every = slice(0, height), slice(0, width)
             seen = (*camera.eye, *camera.target, *camera.center, camera.fov, *size)
-            if seen != self._seen:
-                self._seen, self._backdrop = seen, None
-                return self._picture(wp, raycast, scene, size, every)
-            # the camera stands still: what is far from surfaces and their shadow is drawn once
-            if self._backdrop is None:
-                mesh, shadow = scene.mesh, scene.shadow_map
-                nothing: Any = wp.array(np.full((3, 3), 1e6), dtype=wp.vec3)
-                empty = wp.Mesh(nothing, wp.array([0, 1, 2], dtype=wp.int32))
-                scene.mesh, scene.shadow_map = empty.id, wp.ones((1, 1), dtype=float)
-                self._backdrop = self._picture(wp, raycast, scene, size, every)
-                scene.mesh, scene.shadow_map = mesh, shadow
-            shown = self._backdrop.copy()
-            rows, columns = self._near(points, camera, size)
-            within = self._picture(wp, raycast, scene, size, (rows, columns))
-            inner = [
-                slice(s.start + (s.start > 0), s.stop - (s.stop < n)) for s, n in zip((rows, columns), (height, width))
-            ]
-            shown[inner[0], inner[1]] = within[
-                inner[0].start - rows.start : inner[0].stop - rows.start,
-                inner[1].start - columns.start : inner[1].stop - columns.start,
-            ]
-            return shown
+            if seen != self._seen:  # what is far from surfaces and their shadow is drawn once for a camera
+                self._seen, self._backdrop = seen, self._cast_backdrop(wp, raycast, scene, size)
+            self._cast_shadow(wp, raycast, scene, unit)
+            return self._picture(wp, raycast, scene, points, camera, size)
 
     @staticmethod
-    def _picture(wp: Any, raycast: Any, scene: Any, size: tuple[int, int], part: tuple[slice, slice]) -> Image:
-        """Rows and columns of a picture, with more rays where neighbours differ."""
-        centers = pixel_centers(size).reshape(size[1], size[0], 2)[part]
-        shown = to_bytes(cast_samples(wp, raycast, scene, centers.reshape(-1, 2))).reshape(*centers.shape[:2], 3)
-        edges = edge_pixels(shown)
-        fine = cast_samples(wp, raycast, scene, (centers[edges][:, None] - np.float32(0.5) + _SUBPIXELS).reshape(-1, 2))
-        shown[edges] = to_bytes(fine.reshape(-1, len(_SUBPIXELS), 3).mean(axis=1))
-        return shown
+    def _cast_backdrop(wp: Any, raycast: Any, scene: Any, size: tuple[int, int]) -> tuple[Image, Image]:
+        """The picture without surfaces: by one ray for each pixel, and with more where neighbours differ."""
+        scene.shadow_map = wp.ones((1, 1), dtype=float)
 
-    def _near(self, points: Floats, camera: Camera, size: tuple[int, int]) -> tuple[slice, slice]:
-        """Rows and columns of the pixels in which surfaces and their shadow may be, and their neighbours."""
-        forward, right, up = camera.axes()
-        local = (np.concatenate([points, self._shadow_corners]) - camera.eye) @ np.stack([right, up, forward], axis=1)
-        if self._ghost is not None or local[:, 2].min() <= 0.0:
-            return slice(0, size[1]), slice(0, size[0])
-        tangent = np.tan(np.radians(0.5 * camera.fov)) * np.array([size[0] / size[1], -1.0])
-        place = (0.5 + 0.5 * (local[:, :2] / local[:, 2:] / tangent + np.array(camera.center) * (1.0, -1.0))) * size
-        low, high = np.clip([place.min(axis=0) - 3.0, place.max(axis=0) + 4.0], 0.0, size).astype(int)
-        return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+        def cast(cells: npt.NDArray[np.bool_], offsets: Floats) -> Image:
+            pixels = pixels_of(cells)
+            return to_bytes(cast_pixels(wp, raycast, scene, pixels, offsets, np.full((len(pixels), len(offsets)), -1)))
+
+        raw = cast(np.ones(size[::-1], dtype=bool), MIDDLE).reshape(*size[::-1], 3)
+        fine, edges = raw.copy(), edge_pixels(raw)
+        fine[edges] = cast(edges, SUBPIXELS)
+        return raw, fine
+
+    def _picture(
+        self, wp: Any, raycast: Any, scene: Any, points: Floats, camera: Camera, size: tuple[int, int]
+    ) -> Image:
+        """The backdrop, with rays for the pixels that surfaces or their shadow cover, more where neighbours differ."""
+        assert self._backdrop is not None
+        corners = self._shadow_corners
+        place, depth = camera.pixels(np.concatenate([points, camera.target + camera.size * corners]), size)
+        infront = depth.min() > 0.0
+        low, high = np.zeros(2, dtype=int), np.array(size)
+        if infront and self._ghost is None:
+            low, high = np.clip([place.min(axis=0) - 3.0, place.max(axis=0) + 4.0], 0.0, size).astype(int)
+        part = slice(low[1], high[1]), slice(low[0], high[0])
+        drawn = np.column_stack([place - low, 1.0 / depth])[: len(points)] if infront else None
+
+        opaque = not (len(self._opacity) or self._ghost or self._cut is not None)
+
+        def cast(cells: npt.NDArray[np.bool_], offsets: Floats, faces: Any = None) -> Image:
+            if faces is None and drawn is not None and opaque:
+                faces = rasterize(wp, raycast, drawn, self.triangles, cells, offsets)
+            return to_bytes(cast_pixels(wp, raycast, scene, pixels_of(cells, low), offsets, faces))
+
+        covered, faces = np.ones((high - low)[::-1], dtype=bool), None
+        if drawn is not None and self._ghost is None:
+            first = rasterize(wp, raycast, drawn, self.triangles, covered, MIDDLE)
+            covered = first.reshape(covered.shape) >= 0
+            if len(corners):
+                begin = np.maximum(place[-4:].min(axis=0) - low - 1.0, 0.0).astype(int)
+                end = np.maximum(place[-4:].max(axis=0) - low + 2.0, 0.0).astype(int)
+                covered[begin[1] : end[1], begin[0] : end[0]] = True
+            faces = first[covered.ravel()] if opaque else None
+        raw = self._backdrop[0][part].copy()
+        raw[covered] = cast(covered, MIDDLE, faces)
+        shown = self._backdrop[1].copy()
+        shown[part][covered] = raw[covered]
+        edges = edge_pixels(raw) & grown(covered)
+        shown[part][edges] = cast(edges, SUBPIXELS)
+        return shown
 
     def _make_scene(
         self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]
@@ -308,54 +321,32 @@ class Renderer:
 
     def _cast_shadow(self, wp: Any, raycast: Any, scene: Any, unit: Floats, cells: int = 112) -> None:
         """Fill the light map of the ground, over the area of possible shadow."""
-        scene.shadow_map = wp.ones((1, 1), dtype=float)
-        scene.shadow_cell_size = 1.0
+        self._shadow_corners = np.zeros((0, 3))
         if not scene.has_ground:
             return
         lights = cone_directions(self._light, 0.14, 24)
         lights = lights[lights[:, 2] > 0.05]
-        fall = np.maximum(unit[:, 2] - scene.ground_height, 0.0)[:, None, None]
-        spots = unit[:, None, :2] - fall * (lights[:, :2] / lights[:, 2:])[None, ::4]
-        low, high = spots.min(axis=(0, 1)), spots.max(axis=(0, 1))
+        slopes = lights[:, :2].astype(np.float64) / lights[:, 2:]
+        height = (unit[:, 2] - scene.ground_height)[:, None]
+        fall = np.maximum(height, 0.0)
+        low = (unit[:, :2] - fall * slopes.max(axis=0)).min(axis=0)
+        high = (unit[:, :2] - fall * slopes.min(axis=0)).max(axis=0)
         cell = float(max((high - low).max(), 1e-6)) / (cells - 4)
-        shape = np.ceil((high - low) / cell).astype(int) + 4
-        scene.shadow_map_corner, scene.shadow_cell_size = wp.vec2(*(low - 2 * cell)), cell
-        parts = [(wp.array(part, dtype=wp.vec3), wp.empty(tuple(map(int, shape)), dtype=float))
-                 for part in np.array_split(lights, min(os.cpu_count() or 1, 8))]  # fmt: skip
-
-        def launch(part: Any, shadow: Any) -> None:
-            wp.launch(raycast.cast_shadow, shadow.shape, [scene, part, shadow], device="cpu")
-
-        launch(parts[0][0][:0], parts[0][1])  # loads the kernel, see `cast_samples`
-        with concurrent.futures.ThreadPoolExecutor(len(parts)) as pool:
-            list(pool.map(launch, *zip(*parts)))
-        mean = sum(len(part) * shadow.numpy() for part, shadow in parts) / len(lights)
-        scene.shadow_map = wp.array(mean, dtype=float)
-
-
-def cast_samples(wp: Any, raycast: Any, scene: Any, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Colours (n, 3), linear light, of places (n, 2) of the picture, cast in as many threads as there are cores."""
-    places, out = wp.array(samples, dtype=wp.vec2), wp.empty(len(samples), dtype=wp.vec3)
-
-    def launch(first: int, last: int) -> None:
-        if last > first:
-            wp.launch(raycast.cast_rays, last - first, [scene, places[first:last], out[first:last]], device="cpu")
-
-    launch(0, min(1, len(samples)))  # loads the kernel, which threads must not do at once
-    ends = np.linspace(1, len(samples), 1 + min(os.cpu_count() or 1, 8, 1 + len(samples) // 4096)).astype(int).tolist()
-    with concurrent.futures.ThreadPoolExecutor(len(ends)) as pool:
-        list(pool.map(launch, ends[:-1], ends[1:]))
-    return np.asarray(out.numpy())
-
-
-@functools.lru_cache(maxsize=4)
-def pixel_centers(size: tuple[int, int]) -> npt.NDArray[np.float32]:
-    """(width x height, 2) middles of the pixels of a picture, row by row."""
-    return np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) + 0.5 for n in size)), axis=-1).reshape(-1, 2)
-
-
-# 8 rooks: one per row and column of an 8 x 8 raster
-_SUBPIXELS = np.array([[(k + 0.5) / 8, ((5 * k + 2) % 8 + 0.5) / 8] for k in range(8)], dtype=np.float32)
+        low = low - 2 * cell
+        columns, rows = np.ceil((high - low) / cell).astype(int) + 2
+        # one grid above the other, for each direction; what lies below the ground is behind the viewer
+        fallen = [(unit[:, :2] - height * slope - low) / cell + (0, k * rows) for k, slope in enumerate(slopes)]
+        corners = np.concatenate([np.column_stack([place, height]) for place in fallen])
+        opaque = self.triangles[self._opacity == 1.0] if len(self._opacity) else self.triangles
+        triangles = np.concatenate([opaque + k * len(unit) for k in range(len(slopes))])
+        faces = rasterize(wp, raycast, corners, triangles, np.ones((len(slopes) * rows, columns), bool), MIDDLE)
+        light = (faces < 0).reshape(len(slopes), rows, columns).mean(axis=0)
+        scene.shadow_map_corner, scene.shadow_cell_size = wp.vec2(*low), cell
+        scene.shadow_map = wp.array(light.T, dtype=float)
+        high = low + cell * np.array([columns, rows])
+        self._shadow_corners = np.array(
+            [(x, y, scene.ground_height) for x in (low[0], high[0]) for y in (low[1], high[1])]
+        )
 
 
 def side_bits(triangles: npt.NDArray[np.integer[Any]], edges: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.int32]:
@@ -367,30 +358,6 @@ def side_bits(triangles: npt.NDArray[np.integer[Any]], edges: npt.NDArray[np.int
         side = np.sort(triangles[:, [(k + 1) % 3, (k + 2) % 3]].astype(np.int64), axis=1) @ np.array([count, 1])
         out |= np.isin(side, known).astype(np.int32) << k
     return out
-
-
-def to_bytes(linear: npt.NDArray[np.float32]) -> Image:
-    """sRGB components, 0 to 255, of linear light, by a table: the nearest ones, or in shades near black one off."""
-    table = _byte_table()
-    return table[(np.clip(linear, 0.0, 1.0) * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.uint16)]
-
-
-@functools.cache
-def _byte_table() -> Image:
-    return np.round(255.0 * to_srgb(np.arange(1 << 16) / 65535.0)).astype(np.uint8)
-
-
-def edge_pixels(image: Image, limit: int = 6) -> npt.NDArray[np.bool_]:
-    """(height, width) pixels of an sRGB picture that differ from a neighbour by more than a limit, of 255."""
-    edges = np.zeros(image.shape[:2], dtype=bool)
-    for channel in np.moveaxis(image.astype(np.int16), 2, 0):  # over an axis of length three numpy is slow
-        down = np.abs(np.diff(channel, axis=0)) > limit
-        across = np.abs(np.diff(channel, axis=1)) > limit
-        edges[1:] |= down
-        edges[:-1] |= down
-        edges[:, 1:] |= across
-        edges[:, :-1] |= across
-    return edges
 
 
 def cone_directions(axis: Floats, tangent: float, count: int) -> npt.NDArray[np.float32]:
