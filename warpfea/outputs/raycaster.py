@@ -212,13 +212,13 @@ class Renderer:
         """The picture without surfaces: by one ray for each pixel, and with more where neighbours differ."""
         scene.shadow_map = wp.ones((1, 1), dtype=float)
 
-        def cast(cells: npt.NDArray[np.bool_], offsets: Floats) -> Image:
+        def drawn_pixels(cells: npt.NDArray[np.bool_], offsets: Floats) -> Image:
             pixels = pixels_of(cells)
             return to_bytes(cast_pixels(wp, raycast, scene, pixels, offsets, np.full((len(pixels), len(offsets)), -1)))
 
-        raw = cast(np.ones(size[::-1], dtype=bool), MIDDLE).reshape(*size[::-1], 3)
+        raw = drawn_pixels(np.ones(size[::-1], dtype=bool), MIDDLE).reshape(*size[::-1], 3)
         fine, edges = raw.copy(), edge_pixels(raw)
-        fine[edges] = cast(edges, SUBPIXELS)
+        fine[edges] = drawn_pixels(edges, SUBPIXELS)
         return raw, fine
 
     def _picture(
@@ -237,7 +237,7 @@ class Renderer:
 
         opaque = not (len(self._opacity) or self._ghost or self._cut is not None)
 
-        def cast(cells: npt.NDArray[np.bool_], offsets: Floats, faces: Any = None) -> Image:
+        def drawn_pixels(cells: npt.NDArray[np.bool_], offsets: Floats, faces: Any = None) -> Image:
             if faces is None and drawn is not None and opaque:
                 faces = rasterize(wp, raycast, drawn, self.triangles, cells, offsets)
             return to_bytes(cast_pixels(wp, raycast, scene, pixels_of(cells, low), offsets, faces))
@@ -252,11 +252,11 @@ class Renderer:
                 covered[begin[1] : end[1], begin[0] : end[0]] = True
             faces = first[covered.ravel()] if opaque else None
         raw = self._backdrop[0][part].copy()
-        raw[covered] = cast(covered, MIDDLE, faces)
+        raw[covered] = drawn_pixels(covered, MIDDLE, faces)
         shown = self._backdrop[1].copy()
         shown[part][covered] = raw[covered]
         edges = edge_pixels(raw) & grown(covered)
-        shown[part][edges] = cast(edges, SUBPIXELS)
+        shown[part][edges] = drawn_pixels(edges, SUBPIXELS)
         return shown
 
     def _make_scene(
@@ -340,9 +340,9 @@ class Renderer:
         opaque = self.triangles[self._opacity == 1.0] if len(self._opacity) else self.triangles
         triangles = np.concatenate([opaque + k * len(unit) for k in range(len(slopes))])
         faces = rasterize(wp, raycast, corners, triangles, np.ones((len(slopes) * rows, columns), bool), MIDDLE)
-        light = (faces < 0).reshape(len(slopes), rows, columns).mean(axis=0)
+        share = (faces < 0).reshape(len(slopes), rows, columns).mean(axis=0)
         scene.shadow_map_corner, scene.shadow_cell_size = wp.vec2(*low), cell
-        scene.shadow_map = wp.array(light.T, dtype=float)
+        scene.shadow_map = wp.array(share.T, dtype=float)
         high = low + cell * np.array([columns, rows])
         self._shadow_corners = np.array(
             [(x, y, scene.ground_height) for x in (low[0], high[0]) for y in (low[1], high[1])]
