@@ -106,7 +106,7 @@ def test_the_limit_of_a_controller() -> None:
 
 
 def test_a_stop_hit_at_10_m_per_s() -> None:
-    """Undamped it is passed by v sqrt(m/k) and left at the speed of the impact; damped by the equation of motion."""
+    """It is passed by v sqrt(m/k), and left at the speed of the impact."""
     b, slide = slider(10.0, limits=wf.Stop(-1.0, 0.2, stiffness=2e4))
     sim = run(b, 5e-4)
     travel = []
@@ -117,23 +117,40 @@ def test_a_stop_hit_at_10_m_per_s() -> None:
     assert sim.joint_rate(slide)[0] == pytest.approx(-10.0, abs=1e-8)
     assert abs(sim.energies()["integrator"][0]) < 1e-8
 
-    def rate(t: float, y: np.ndarray) -> list[float]:
-        force = 2e4 * (y[0] - 0.2) + 60.0 * y[1] if y[0] > 0.2 else 0.0
-        return [y[1], -max(force, 0.0) / 2.0]
 
-    exact = solve_ivp(rate, (0, 0.1), [0.0, 10.0], rtol=1e-10, atol=1e-12, max_step=1e-4).y[:, -1]
-    errors = {}
-    for scheme in SCHEMES:
-        b, slide = slider(10.0, limits=wf.Stop(-1.0, 0.2, stiffness=2e4, damping=60.0))
-        sim = run(b, 5e-4, scheme)
-        sim.run(0.1)
-        errors[scheme] = abs(sim.joint_rate(slide)[0] - exact[1])
-        assert sim.energies()["spring_loss"][0] == pytest.approx(100.0 - exact[1] ** 2, rel=0.1)
-    assert max(errors.values()) < 0.5, errors
-    assert errors["energy_momentum"] < 0.02, errors
-    sim = wf.Simulation(b.finalize(device="cpu"), dt="auto", error=1e-4, integrator="bdf2", **TIGHT)
-    sim.run(0.1)
-    assert sim.joint_rate(slide)[0] == pytest.approx(exact[1], abs=0.02)
+@pytest.mark.parametrize(
+    ("scheme", "h"),
+    [("backward_euler", 5e-4), ("bdf2", 2.5e-4), ("energy_momentum", 1e-3), ("generalized_alpha", 2.5e-4)],
+)
+def test_a_damped_stop_hit_at_10_m_per_s(scheme: str, h: float) -> None:
+    """Until k p + c dp/dt = 0 of the damped vibration p, wherever in a step it begins: speed, place and loss are of
+    the scheme's order."""
+    m, k, c, v = 2.0, 2e4, 60.0, 10.0
+    decay = 0.5 * c / m
+    w = np.sqrt(k / m - decay**2)
+    t = np.arctan2(c * w, c * decay - k) / w
+    depth = v / w * np.exp(-decay * t) * np.sin(w * t)
+    speed = v * np.exp(-decay * t) * (np.cos(w * t) - decay / w * np.sin(w * t))
+    assert k * depth + c * speed == pytest.approx(0.0, abs=1e-9)
+    b, slide = slider(v, limits=wf.Stop(-1.0, 1.0, stiffness=k, damping=c))
+    ends = v * h * (2.0 + np.array([0.125, 0.375, 0.625, 0.875]))
+    errors = []
+    for dt in (h, 0.5 * h):
+        sim = run(b, dt, scheme, worlds=4)
+        sim.model.set_parameter("slide.upper", ends)
+        sim.run(0.036)
+        place = ends + depth + speed * (0.036 - ends / v - t)
+        losses = sim.energies()["spring_loss"] - 0.5 * m * (v**2 - speed**2)
+        errors.append([np.abs(sim.joint_rate(slide) - speed).max(), np.abs(sim.joint_value(slide) - place).max(),
+                       np.abs(losses).max()])  # fmt: skip
+    ratios = np.array(errors[0]) / errors[1]
+    assert ratios.min() > (1.8 if scheme == "backward_euler" else 3.5), errors
+    assert errors[1] < ([0.25, 8e-3, 3.0] if scheme == "backward_euler" else [3e-3, 1e-4, 0.05]), errors
+    if scheme == "bdf2":
+        sim = wf.Simulation(b.finalize(device="cpu"), dt="auto", error=1e-4, integrator=scheme, **TIGHT)
+        sim.model.set_parameter("slide.upper", ends[:1])
+        sim.run(0.036)
+        assert sim.joint_rate(slide) == pytest.approx(speed, abs=0.02)
 
 
 def test_stops_by_default_take_most_of_the_speed() -> None:
@@ -151,7 +168,7 @@ def test_stops_by_default_take_most_of_the_speed() -> None:
 def test_stops_never_throw_back() -> None:
     """A critically damped stop returns e^-2 of the speed; steps that do not resolve it return less, and none is refused
     or books a negative loss, wherever in a step the stop is met."""
-    for h, most, least in ((2e-4, 0.14, 0.13), (1e-3, 0.15, 0.0), (1e-2, 0.05, 0.0)):
+    for h, least in ((2e-4, 0.13), (2e-3, 0.0), (1e-2, 0.0)):
         for speed in (8.7, 9.4, 10.0, 10.6):
             b, slide = slider(speed, limits=(-10.0, 1.0))
             sim = run(b, h, "bdf2")
@@ -159,7 +176,7 @@ def test_stops_never_throw_back() -> None:
             for _ in range(round(1.0 / speed / h) + max(4, round(6e-3 / h))):
                 sim.step()
                 losses.append(sim.energies()["spring_loss"][0])
-            assert least < -sim.joint_rate(slide)[0] / speed < most, (h, speed)
+            assert least < -sim.joint_rate(slide)[0] / speed < np.exp(-2.0), (h, speed)
             assert min(np.diff(losses)) >= 0.0, (h, speed)
             assert losses[-1] < speed**2
 

@@ -10,14 +10,17 @@ from .types import int_1d, precision
 __all__ = [
     "IMPACT_FOUND",
     "IMPACT_REPEATED",
+    "RESTART_FOUND",
+    "RESTART_REPEATED",
     "balance_struct",
     "pattern_struct",
     "product_terms_struct",
     "topology_struct",
 ]
 
-IMPACT_FOUND, IMPACT_REPEATED = 1, 2
-"""Values of `impact` of the step control: the attempt does not resolve an impact; it is taken again for that reason."""
+IMPACT_FOUND, RESTART_FOUND, IMPACT_REPEATED, RESTART_REPEATED = 1, 2, 3, 4
+"""Values of `impact` of the step control: the attempt does not resolve an impact, or what the scheme remembers of the
+step before does not fit its forces; it is taken again for that reason, by backward Euler."""
 
 
 @functools.cache

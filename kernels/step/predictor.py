@@ -62,7 +62,7 @@ def predictor_kernels(dtype: str, accelerated: bool, impacts: bool, module: wp.M
         if step.running[world] == 0:
             return
         if wp.static(impacts):
-            if step.impact[world] == IMPACT_REPEATED:
+            if step.impact[world] >= IMPACT_REPEATED:
                 return
         if predictor.history_state[world, 2] == step.h[world] and predictor.history_state[world, 3] == step.time[world]:
             predictor.order[world] = int(predictor.history_state[world, 0])

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, free_components_function
+from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, RESTART_FOUND, RESTART_REPEATED, free_components_function
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_2d, f64, int_1d, precision
 from ..solvers.newton_control import Failure, control_struct
@@ -59,7 +59,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         c.dq_dv = step.h[world]
         c.mass_factor = f64(1.0) / step.h[world]
         if wp.static(impacts):
-            if step.impact[world] == IMPACT_REPEATED:
+            if step.impact[world] >= IMPACT_REPEATED:
                 return c
         return coefficients(step.h[world], previous, step.scheme_parameter)
 
@@ -201,7 +201,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
                     ratio = T(step.h[world] / step.previous_h[world])
                     first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
         if wp.static(impacts):
-            if step.impact[world] == IMPACT_REPEATED:  # where the attempt before has found the bodies
+            if step.impact[world] >= IMPACT_REPEATED:  # where the attempt before has found the bodies
                 first = (T(1.0) / T(step.dq_dv[world])) * (u[world, slot] - q)
         keep = (T(1.0) / T(step.dq_dv[world])) * (u_n[world, slot] - q)
         v[world, slot] = free_components(free[slot], first, keep)
@@ -229,8 +229,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         """
         world = wp.tid()
         if wp.static(impacts):
-            if step.impact[world] == IMPACT_FOUND and newton.failed[world] == 0 and newton.inverted[world] == 0:
-                step.impact[world] = IMPACT_REPEATED
+            found = step.impact[world] > 0 and step.impact[world] <= RESTART_FOUND
+            if found and newton.failed[world] == 0 and newton.inverted[world] == 0:
+                step.impact[world] = step.impact[world] + (IMPACT_REPEATED - IMPACT_FOUND)
                 wp.atomic_max(step.any_running, 0, 1)
                 return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
@@ -292,7 +293,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         """Store the accepted iterate in the state.
 
         After an impact what the scheme remembers of accelerations stays as before it, and total momentum that of the
-        forces: accelerations, or the increment of the velocity in the step before.
+        forces: accelerations, or the increment of the velocity in the step before. A restart leaves those of its step.
         """
         world, slot = wp.tid()
         impact = False
@@ -308,12 +309,15 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
                 remembered = v[world, slot] - T(ratio) * gained
             v_before[world, slot] = remembered
         if wp.static(accelerated) and not impact:
-            c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
+            c = attempt_coefficients(step, world, step.acceleration_step[world])
             a = u_before[world, slot]
             new = v[world, slot]
             before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
             u_before[world, slot] = T(c.a_v) * (new - v_n[world, slot]) - T(c.a_a) * a
             v_before[world, slot] = T(c.mass_factor) * (new - before)
+            if wp.static(impacts):
+                if step.impact[world] == RESTART_REPEATED:
+                    u_before[world, slot] = v_before[world, slot]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
             if wp.static(multistep or accelerated):

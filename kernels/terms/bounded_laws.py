@@ -124,11 +124,12 @@ def bounded_functions(midpoint: bool) -> KernelSet:
 
     @wp.func
     def increments(
-        spr: Springs, world: int, sp: int, winding: f64, y0: f64, y: f64, anchor: f64, force: f64
+        spr: Springs, world: int, sp: int, winding: f64, y0: f64, y: f64, anchor: f64, force: f64, mean_rate: f64
     ) -> wp.vec3d:  # fmt: skip
         """Stored energy at y, energy lost in a step from y0, and work of actuators in it.
 
-        What the elastic part of a stop or controller does beside its energy is the integrator's, as of springs.
+        What the elastic part of a stop or controller does beside its energy is the integrator's, as of springs; a stop
+        loses what its damper takes at the mean rate, of second order.
         """
         if spr.law[sp] >= FEEDBACK:
             mean = force
@@ -145,8 +146,11 @@ def bounded_functions(midpoint: bool) -> KernelSet:
             return wp.vec3d(stored, force * (y - y0) - stored + energy(spr, world, sp, winding, y0, anchor), f64(0.0))
         moved, elastic_force = y - y0, spr.stiffness[world, sp] * (y - after)
         if spr.law[sp] == STOP:
-            p = penetration(spr, world, sp, winding, y)
-            moved, elastic_force = p - penetration(spr, world, sp, winding, y0), spr.stiffness[world, sp] * p
+            p, p0 = penetration(spr, world, sp, winding, y), penetration(spr, world, sp, winding, y0)
+            moved, elastic_force = p - p0, f64(0.5) * spr.stiffness[world, sp] * (p + p0)
+            force = elastic_force + spr.damping[world, sp] * mean_rate
+            if force * (p + p0) <= f64(0.0):
+                force = f64(0.0)
         loss = force * slip + wp.max((force - elastic_force) * (moved - slip), f64(0.0))
         return wp.vec3d(stored, loss, f64(0.0))
 

@@ -22,7 +22,7 @@ import warp as wp
 
 from ..common.block_entries import add_block_function
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import IMPACT_FOUND, pattern_struct, topology_struct
+from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, RESTART_FOUND, pattern_struct, topology_struct
 from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
 from .bounded_laws import FRICTION, STOP, bounded_functions
 from .chords import chord_functions
@@ -302,7 +302,7 @@ def spring_kernels(
     @masked_kernel(module, "active")
     def energies(
         spr: Springs, u: p.vec3_2d, start: p.vec3_2d, u_n: p.vec3_2d, law_value: vec3d_2d, in_motion: f64,
-        dq_dv: double_1d, active: int_1d, scr: Scratch, rows: double_3d,
+        dq_dv: double_1d, h: double_1d, active: int_1d, scr: Scratch, rows: double_3d,
     ):  # fmt: skip
         """Stored energy at u, what viscous forces and friction take in the step from u_n, and the work of actuators."""
         world, item = wp.tid()
@@ -329,7 +329,7 @@ def spring_kernels(
                 value, anchor = scheduled(spr, law_value, world, sp), scr.anchor[world, item]
                 reference = scr.reference[world, item]
                 force = more.bounded_force(spr, world, sp, winding, y0, y, reference, inverse, anchor, value)[0]
-                change = more.increments(spr, world, sp, winding, y0, y, anchor, force)
+                change = more.increments(spr, world, sp, winding, y0, y, anchor, force, in_motion * (y - y0) / h[world])
                 for row in range(3):
                     rows[row, world, item] = change[row]
                 rows[3, world, item] = change[2]
@@ -348,13 +348,13 @@ def spring_kernels(
             spr: Springs, u: p.vec3_2d, h: double_1d, dq_dv: double_1d, running: int_1d, failed: int_1d, scr: Scratch,
             impact: int_1d,
         ):  # fmt: skip
-            """Flag worlds whose converged attempt changes the penetration of a stop by more than half of it, or that of
-            a strong damper, but where the force changes by less than 1 %: the step resolves the impact."""
+            """Flag worlds whose converged attempt hits a stop, or, to restart, does not resolve its force: in the step
+            after a hit, where the force changes by half, and where what the scheme remembers of it throws back a body
+            that the stop has let go (a tenth of its rate; bounds: a tenth to all, and 0.02 to 0.1, serve as well)."""
             world, item = wp.tid()
             sp = spr.spring[item]
-            if running[world] == 0 or failed[world] != 0 or impact[world] != 0 or spr.law[sp] != STOP:
-                return
-            if scr.force[world, item] == mat33d():
+            seen = impact[world] == IMPACT_FOUND or impact[world] >= IMPACT_REPEATED
+            if running[world] == 0 or failed[world] != 0 or seen or spr.law[sp] != STOP:
                 return
             y0 = scr.start[world, item]
             y = c.coordinate(spr.kind[item], spr.reference[item] + vectors(spr, u, world, item), y0)
@@ -362,12 +362,19 @@ def spring_kernels(
             before, depth = more.penetration(spr, world, sp, winding, y0), more.penetration(spr, world, sp, winding, y)
             k, damping = spr.stiffness[world, sp], spr.damping[world, sp]
             rate, mean_rate = (y - scr.reference[world, item]) / dq_dv[world], (y - y0) / h[world]
-            force_change = k * wp.abs(depth - before) + f64(2.0) * damping * wp.abs(rate - mean_rate)
-            if depth * before > f64(0.0) and force_change < f64(0.01) * wp.abs(k * depth + damping * rate):
+            if scr.force[world, item] == mat33d():
+                if before != f64(0.0) and wp.abs(rate - mean_rate) > f64(0.1) * wp.abs(rate):
+                    impact[world] = RESTART_FOUND
                 return
-            change = (k + damping / h[world]) * wp.abs(depth - before)
-            if change > f64(0.5) * k * wp.max(wp.abs(depth), wp.abs(before)):
+            if before * depth <= f64(0.0):
                 impact[world] = IMPACT_FOUND
+                return
+            change = k * wp.abs(depth - before)
+            force_change = change + f64(2.0) * damping * wp.abs(rate - mean_rate)
+            force = wp.abs(k * depth + damping * rate)
+            largest = wp.max(wp.abs(depth), wp.abs(before))
+            if change > f64(0.4) * k * largest or force_change > f64(0.5) * force:
+                impact[world] = RESTART_FOUND
 
     @masked_kernel(module, "active")
     def store_history(

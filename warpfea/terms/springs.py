@@ -298,7 +298,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
         scratch, rows = ctx.scratch[self.name]
         start, step = self.start_of_step(ctx)
-        args = [self.data, ctx.work.u, start, ctx.state.displacement, *step, accepted, scratch, rows]
+        args = [self.data, ctx.work.u, start, ctx.state.displacement, *step, ctx.work.step.h, accepted, scratch, rows]
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return rows
 
@@ -320,7 +320,8 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
         scratch, rows = ctx.scratch[self.name]
         u = ctx.state.displacement
         values = ctx.work.time_law_stage_values
-        args = [self.data, u, u, u, values, 0.0, wp.ones_like(ctx.work.step.dq_dv), active, scratch, rows]
+        one = wp.ones_like(ctx.work.step.dq_dv)
+        args = [self.data, u, u, u, values, 0.0, one, one, active, scratch, rows]
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return {"springs": rows.numpy()[0].sum(axis=1)}
 
