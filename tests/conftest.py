@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import gc
 import json
+import os
+import sys
 import types
 from pathlib import Path
 
@@ -18,6 +20,8 @@ import warpfea as wf
 
 DATA = Path(__file__).parent / "data"
 
+sys.dont_write_bytecode = False  # processes of tests would translate the package anew, a third of their start
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 wp.config.log_level = 30  # warnings and errors: no greeting, no lines for loaded modules
 gc.set_threshold(100_000, 20, 50)  # a worker holds the syntax trees of all kernels, which each collection goes through
 

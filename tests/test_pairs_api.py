@@ -9,6 +9,7 @@ import pytest
 
 import warpfea as wf
 from warpfea.cli import main
+from warpfea.model import assembly, edges
 from warpfea.simulation.checkpoint import save_checkpoint
 
 RUBBER = wf.SVK(E=1e6, nu=0.3, density=1000.0)
@@ -357,3 +358,19 @@ def test_a_scene_without_pairs_has_nothing_of_them(obstacle):
     assert "contact between bodies" in model.info()["left_out"]
     assert not [module for module in sim.stepper.launch.modules if "pair" in module]
     assert not [name for name in sim.state.specs if name.startswith("pairs")]
+
+
+def test_a_surface_is_evaluated_once_for_all_its_pairs(monkeypatch):
+    """The work grows with the number of bodies, not with its square as pairs do."""
+    calls, counts, evaluate = [], [], assembly.facet_tables
+    for module in (assembly, edges):
+        monkeypatch.setattr(module, "facet_tables", lambda *args, **named: calls.append(1) or evaluate(*args, **named))
+    for count in (3, 5, 7):
+        b, before = wf.ModelBuilder(), len(calls)
+        for k in range(count):
+            b.add_solid(wf.mesh.box((1,) * 3, cells=(1, 1, 1), element="T4", origin=(k, 0, 0)), material=RUBBER)
+        b.add_collider(wf.HalfSpace((0, 0, 1)))
+        assert len(b.add_contact_all()) == count * (count + 1) / 2
+        b.finalize(device="cpu")
+        counts.append(len(calls) - before)
+    assert counts[2] - counts[1] == counts[1] - counts[0] > 0

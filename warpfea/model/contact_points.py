@@ -16,7 +16,7 @@ from ..elements.quadrature import lobatto_square, triangle_3, triangle_7
 from ..materials import Material
 from . import assembly
 from .discretisation import Discretisation
-from .handles import SurfaceSet
+from .handles import SurfaceSet, once_per_surface
 from .masses import all_mass_parts
 from .narrow import rules_for_width
 
@@ -177,6 +177,7 @@ def check_contact_points(surface: SurfaceSet, points: Any) -> None:
             )
 
 
+@once_per_surface
 def element_edge_and_depth(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
     """Edge of each face of a surface, and depth of the element behind it, both (F,), m.
 

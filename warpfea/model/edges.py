@@ -11,7 +11,7 @@ from ..elements import Rule
 from ..kernels.contact.edges import EDGE_MARGIN
 from .assembly import at_points, facet_tables
 from .contact_points import ContactPoints, element_edge_and_depth
-from .handles import SurfaceSet
+from .handles import SurfaceSet, once_per_surface
 
 __all__ = ["Edges", "parts_of", "sharp_edges_of", "sharp_sides", "with_edges"]
 
@@ -51,6 +51,7 @@ class Edges:
         return Edges(**rest, shape=self.shape[..., of], X=self.X[:, :, of])
 
 
+@once_per_surface
 def sharp_edges_of(surface: SurfaceSet, *, both: bool = False) -> Edges:
     """Sharp edges of a surface: convex ones between two facets with more than twice `EDGE_MARGIN` to either side, each
     once, or with `both` as a side of each of the two."""
@@ -156,6 +157,7 @@ def with_edges(p: ContactPoints, edges: Edges) -> ContactPoints:
     return ContactPoints(**both, rows=np.concatenate([rows, facet]))
 
 
+@once_per_surface
 def sharp_sides(surface: SurfaceSet) -> np.ndarray:
     """(4, F) half the angle between the normals at sharp sides of facets, rad, else 0."""
     out, edges = np.zeros((4, len(surface.faces))), sharp_edges_of(surface)

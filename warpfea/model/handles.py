@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from .discretisation import Discretisation
 
-__all__ = ["ElementSet", "MaterialPoint", "NodeSet", "SurfaceSet"]
+__all__ = ["ElementSet", "MaterialPoint", "NodeSet", "SurfaceSet", "once_per_surface"]
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,3 +93,20 @@ def _describe(handle: _IndexSet | SurfaceSet, what: str) -> str:
     """A set in one line."""
     name = f"{handle.name!r}, " if handle.name else ""
     return f"{type(handle).__name__}({name}{len(handle)} {what} of body {handle.body.name!r})"
+
+
+def once_per_surface(function: F) -> F:
+    """Decorator of a function of a surface and hashable values that is evaluated once for the same faces of a body.
+
+    Of thirty bodies that may all touch each other it is asked for 435 pairs. What it returns must not be changed.
+    """
+    known: weakref.WeakKeyDictionary[Discretisation, dict[Any, Any]] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(function)
+    def remembered(surface: SurfaceSet, *values: Any, **named: Any) -> Any:
+        of_body, key = known.setdefault(surface.body, {}), (surface.faces.tobytes(), values, *named.items())
+        if key not in of_body:
+            of_body[key] = function(surface, *values, **named)
+        return of_body[key]
+
+    return remembered  # type: ignore[return-value]

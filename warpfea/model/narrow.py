@@ -10,7 +10,7 @@ from ..elements import Rule
 from ..elements.quadrature import trapezoidal_rule
 from . import assembly
 from .discretisation import Discretisation
-from .handles import SurfaceSet
+from .handles import SurfaceSet, once_per_surface
 
 __all__ = ["WIDEST_GAP", "body_widths", "facet_size", "is_narrow", "rules_for_width"]
 
@@ -36,6 +36,7 @@ def _sides(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
     return sides, assembly.facet_areas(body, t).sum(axis=1)
 
 
+@once_per_surface
 def facet_size(surface: SurfaceSet) -> tuple[float, float]:
     """Mean longer side of facets by their area, of triangles over sqrt(2), and root of their mean area, m."""
     sides, area = _sides(surface)

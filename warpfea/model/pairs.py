@@ -18,7 +18,7 @@ from .contact_points import ContactPoints, effective_modulus, points_by_faces, p
 from .contacts import ContactOptions
 from .discretisation import element_functions
 from .edges import Edges, parts_of, sharp_edges_of, sharp_sides
-from .handles import SurfaceSet
+from .handles import SurfaceSet, once_per_surface
 from .narrow import body_widths, facet_size, is_narrow, rules_for_width
 from .surfaces import measure_to_skin
 
@@ -149,6 +149,7 @@ class MasterFacets:
     half_angle: np.ndarray
 
 
+@once_per_surface
 def pair_points(surface: SurfaceSet, points: int | None = None, width: float | None = None) -> ContactPoints:
     """Points of a slave surface, corners included: `points` per face, or 16, since meshes need not match; None with a
     `width`, m: equidistant ones that a thing of this width can't pass between."""
@@ -157,6 +158,7 @@ def pair_points(surface: SurfaceSet, points: int | None = None, width: float | N
     return points_by_rules(surface, PAIR_RULES, {3: 16, 4: 16}, points)
 
 
+@once_per_surface
 def facet_point_areas(surface: SurfaceSet) -> np.ndarray:
     """(F, 16) areas of `pair_points`, m^2."""
     rules = rules_of_faces(surface, {corners: known[16] for corners, known in PAIR_RULES.items()})

@@ -195,12 +195,13 @@ def segment_points(slave: SurfaceSet, master: SurfaceSet, points: int | None = N
     order = np.argsort(facets, kind="stable")
     rows, ab, weight = (np.concatenate(v)[order] for v in ([facets], places, weights))
     p, values = pair_points(slave, 16), np.empty((*weight.shape, 16))
+    area = p.area.copy()
     for n in np.unique(sides):
         of, known = sides[rows] == n, PAIR_RULES[n][16]
         at = monomials(ab[of].reshape(-1, 2), n, 3) @ np.linalg.pinv(monomials(known.points, n, 3))
         values[of] = at.reshape(-1, *values.shape[1:])
-        p.area[sides == n] /= known.weights
-    shape, X, normal = (values @ v[rows] for v in (p.shape, p.X, p.normal * p.area[..., None]))
+        area[sides == n] /= known.weights
+    shape, X, normal = (values @ v[rows] for v in (p.shape, p.X, p.normal * area[..., None]))
     density = np.linalg.norm(normal, axis=2)
     np.divide(normal, density[..., None], out=normal, where=density[..., None] > 0.0)
     return ContactPoints(p.conn[rows], shape, density * weight, X, normal, p.faces[rows], rows)
