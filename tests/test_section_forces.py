@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpfea as wf
 
@@ -13,6 +14,12 @@ SOFT = wf.SVK(E=1e6, nu=0.0, density=RHO)
 def bar(b, law=LAW, name="beam"):
     section, line = wf.Rectangle(0.05, 0.05), [(0, 0, 0), (1, 0, 0)]
     return b.add_beam(line, elements=4, section=section, normal=(0, 0, 1), material=law, name=name)
+
+
+@wp.func
+def pull(x: wp.vec3, t: float):
+    """Body force, N/kg."""
+    return wp.vec3(0.0, 0.0, -10.0 - 10.0 * x[0])
 
 
 class Halfway:
@@ -94,3 +101,31 @@ def test_rotating_bar():
     found = sim.field("section_force", beam)[0]
     assert found[:, 0] == pytest.approx(exact, abs=1e-2 * exact.max())
     assert found[[0, -1]] == pytest.approx(0.0, abs=1e-6 * exact.max())
+
+
+def test_pressure_body_force_and_contact_within_elements():
+    """Q = int q under a small pressure and a body force; in contact, at a clamp the reaction and nothing at the tip."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    beam = bar(b)
+    b.clamp(beam.start, slots="all")
+    b.add_pressure(beam.surface("normal+"), 20.0)
+    b.add_body_force(pull)
+    r = wf.solve_static(b.finalize(device="cpu"), load_steps=1, tol=1e-12, unstable="ignore")
+    x = np.linspace(0, 1, 5)
+    exact = 20.0 * 0.05 * (1 - x) + RHO * AREA * (10 * (1 - x) + 5 * (1 - x**2))
+    assert np.abs(np.abs(r.field("section_force.Qz", beam)[0]) - exact).max() < 1e-4 * exact[0]
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    beam = bar(b, law=SOFT)
+    b.clamp(beam.start, slots="all")
+    b.add_pressure(beam.surface("normal+"), 20.0)
+    b.add_body_force(pull)
+    b.add_contact(beam.surface("normal-"), b.add_collider(wf.HalfSpace((0, 0, 1), -0.03)), mu=0.3)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=5e-3, solver=wf.NewtonPCG(tol=1e-10))
+    sim.run(0.15)
+    assert sim.field("contact_pressure", beam).max() > 100.0
+    force, moment = np.split(sim.field("section_force", beam)[0], 2, axis=1)
+    reaction, moment_of_it = sim.reaction(beam.start)[0], sim.reaction_moment(beam.start)[0]
+    assert np.linalg.norm(force[0]) == pytest.approx(np.linalg.norm(reaction), rel=1e-9)
+    assert np.linalg.norm(moment[0]) == pytest.approx(np.linalg.norm(moment_of_it), rel=1e-9)
+    assert np.abs(force[-1]).max() < 1e-8 * exact[0]
+    assert np.abs(moment[-1]).max() < 1e-8 * exact[0]

@@ -50,7 +50,7 @@ class State:
         step_loads: of the state of a simulation, see `step_loads` in simulation/sampling.py.
     """
 
-    step_loads: Callable[[], tuple[np.ndarray, np.ndarray] | None] = staticmethod(lambda: None)
+    step_loads: Callable[[], Any] = staticmethod(lambda: None)
 
     displacement: wp.array
     velocity: wp.array

@@ -38,9 +38,10 @@ def accelerations(stepper: Stepper) -> np.ndarray:
     return np.asarray(w.step.mass_factor.numpy()[:, None, None] * (w.v.numpy() - w.v_tilde.numpy()))
 
 
-def step_loads(reference: weakref.ref[Stepper], statistics: RunStatistics) -> tuple[np.ndarray, np.ndarray] | None:
-    """Gravity less acceleration (worlds, slots, 3), m/s^2, and values of the time laws (worlds, laws, 3), both of the
-    last step; zero in worlds without one, whose accelerations are unknown. None once the stepper is gone."""
+def step_loads(reference: weakref.ref[Stepper], statistics: RunStatistics) -> Any:
+    """Gravity less acceleration (worlds, slots, 3), m/s^2, values of the time laws (worlds, laws, 3), and slots and
+    forces of `TermSet.item_forces`, all of the last step; zero in worlds without one, whose accelerations are unknown.
+    None once the stepper is gone."""
     stepper = reference()
     if stepper is None:
         return None
@@ -52,7 +53,8 @@ def step_loads(reference: weakref.ref[Stepper], statistics: RunStatistics) -> tu
     if not stepper.integrator.static:
         pull = pull - accelerations(stepper)
     flags = statistics.stepped_worlds[:, None, None]
-    return np.where(flags, pull, 0.0), np.where(flags, w.time_law_stage_values.numpy(), 0.0)
+    items = [(conn, np.where(flags[..., None], f, 0.0)) for conn, f in stepper.terms.item_forces(w)]
+    return np.where(flags, pull, 0.0), np.where(flags, w.time_law_stage_values.numpy(), 0.0), items
 
 
 class PointWeights:

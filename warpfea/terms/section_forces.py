@@ -59,8 +59,8 @@ def _present_axes(body: Any, state: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _element_loads(model: Model, body: Any, state: State) -> np.ndarray:
-    """Consistent loads (worlds, elements, slots, 3) of weight, inertia and tractions on side faces on each element, so
-    that the nodal forces less these are the resultants at its ends."""
+    """Consistent loads (worlds, elements, slots, 3) of weight, inertia, tractions and pressure on side faces, contact
+    and body forces on each element, so that the nodal forces less these are the resultants at its ends."""
     out = np.zeros((model.worlds, *body.connectivity.shape, 3))
     known = state.step_loads()
     if known is None:
@@ -83,7 +83,31 @@ def _element_loads(model: Model, body: Any, state: State) -> np.ndarray:
             weights = np.where(side[:, None], weights, 0.0)
             at: Any = slice(None), elements[:, None], slots
             np.add.at(out, at, weights[:, :, None] * law_values[:, law, None, None])
+    for conn, forces in known[2]:
+        _add_items(out, body, conn - body.slot_offset, forces)
     return out
+
+
+def _add_items(out: np.ndarray, body: Any, conn: np.ndarray, forces: np.ndarray) -> None:
+    """Add forces (worlds, items, k, 3) on slots (items, k) of a body to the element that holds them; those on one node
+    act at it."""
+    nodes = len(body.mesh.points)
+    node = np.full(body.slot_count + 1, nodes)
+    node[body.node_slot[:, None] + np.arange(4)] = np.arange(nodes)[:, None]
+    inside = ((conn >= 0) & (conn < body.slot_count)).all(axis=1)
+    acting = inside[:, None] & (forces != 0.0).any(axis=(0, 3))
+    at = node[np.where(acting, conn, -1)]
+    low, high = at.min(axis=1), np.where(acting, at, -1).max(axis=1)
+    pairs = np.sort(body.mesh.cells, axis=1)
+    order = np.lexsort(pairs.T[::-1])
+    number = pairs[order] @ np.array([nodes + 1, 1])
+    wanted = low * (nodes + 1) + high
+    found = np.searchsorted(number, wanted).clip(max=len(number) - 1)
+    items = np.flatnonzero((low < high) & (number[found] == wanted))
+    elements = order[found[items]]
+    slots = np.argmax(body.connectivity[elements][:, None] == conn[items][:, :, None], axis=2)
+    index: Any = slice(None), elements[:, None], slots
+    np.add.at(out, index, forces[:, items])
 
 
 def _of_beam(model: Model, body: Any, state: State) -> np.ndarray:

@@ -210,6 +210,20 @@ class TermSet:
             pool = self._gather_topology(conns)
             topology.pool_start, topology.pool_entry = pool.contribution_start, pool.contribution_entry
 
+    def item_forces(self, work: Workspace) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Model slots (items, k) of facets, elements and points on several slots, and forces on them (worlds, items, k,
+        3), N, as terms evaluated them last."""
+        out = []
+        for term in self.all:
+            first, pool = term.offset, work.pool_force if term.potential else work.nonpotential_contribution
+            values = (-1.0 if term.potential else 1.0) * pool.numpy().astype(float) if term.connectivity else None
+            for conn in term.connectivity:
+                if values is not None and conn.shape[1] > 1:
+                    own = values[:, first : first + conn.size].reshape(len(values), *conn.T.shape, 3)
+                    out.append((conn, np.swapaxes(own, 1, 2)))
+                first += conn.size
+        return out
+
     def mark_constrained(self, free: np.ndarray) -> None:
         """Clear the directions (components, 3) in which terms tie components to the ground.
 
