@@ -1,11 +1,15 @@
 """Uses of gradients: their cost, and the examples of warpfea/simulation/EXAMPLES.md."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import parameter_models as models
 import pytest
-from gradient_models import linked
+from gradient_models import TARGET, linked
 from result_files import content_of
 
 import warpfea as wf
+from warpfea.solvers.choice import choose_adjoint_operator, choose_solver
 
 MAX_RATIO = {"pendulum": 1.0, "finger": 1.0, "gripper": 2.5}  # that of contact is not symmetric
 FILES = [
@@ -44,6 +48,61 @@ def test_a_gripper_learns_in_256_worlds():
     (row,) = content_of("gripper_learning_h200.json", "python tests/gripper_learning.py cuda")["rows"]
     assert row["worlds"] == 256
     assert row["losses"][-1] < 0.1 * row["losses"][0]
+
+
+def counted(extrapolates, target):
+    """Gradients of a body; PCG iterations of its steps back, and how often the preconditioner was built."""
+    m = models.model(models.solid(), models.material(models.NEO))
+    sim = wf.Simulation(m, dt=5e-4)
+    tape = wf.Adjoint(sim, ["body.E", "initial.velocity"])
+    tape.solver.extrapolates = extrapolates
+    tape.run(len(target))
+    newton, back, iterations, places = tape.stepper.newton, tape._step_back, [], []
+    assert not newton.residual.uses_matrix  # no matrix of each step
+
+    def step_back(*args):
+        back(*args)
+        iterations.append(int(tape.stepper.work.pcg.step_iterations.numpy()[0]))
+        places.append(newton.preconditioner.reuse.linearisation_point.numpy().tobytes())
+
+    tape._step_back = step_back
+    loss = wf.loss.sum_of_squares(tape.probe("tip"), target)
+    g = {name: array.numpy() for name, array in tape.backward(loss).items()}
+    assert (tape.residual < 1e-10).all()
+    a = tape.solver
+    for array in a.bars.values():
+        array.zero_()
+    a.solve()
+    assert not a.w.numpy().any()  # whatever the steps before
+    return g, iterations, len(set(places))
+
+
+def test_a_step_back_begins_beside_its_solution_with_kept_factors():
+    smooth = np.full((40, 3), TARGET)
+    smooth[32] = 1.0  # with a jump
+    runs = [counted(flag, smooth) for flag in (True, False)]
+    for found, other in zip(runs[0][0].values(), runs[1][0].values()):
+        assert found == pytest.approx(other, rel=1e-8, abs=1e-8 * np.abs(other).max())
+    (_, quick, builds), (_, slow, _) = runs
+    assert sum(quick[20:]) < 0.65 * sum(slow[20:])
+    assert sum(quick[4:16]) < 0.93 * sum(slow[4:16])  # of low order about the jump
+    assert builds <= 3
+    rough = np.random.default_rng(3).normal(0.0, 0.1, (40, 3))
+    runs = [counted(flag, rough) for flag in (True, False)]
+    assert sum(runs[0][1]) <= 1.02 * sum(runs[1][1])  # extrapolations that are worse than 0 are left out
+
+
+def test_products_of_the_adjoint():
+    gpu = SimpleNamespace(is_cuda=True)
+    cases = {"T10": models.solid(), "T4": models.solid("T4"), "3243": models.beam()}
+    found = {}
+    for name, add in cases.items():
+        m = models.model(add, models.material())
+        plans = choose_solver(m, m.device), choose_solver(m, gpu, many=True)
+        found[name] = [choose_adjoint_operator(m, plan) for plan in plans]
+    assert found == {"T10": ["elements", "elements"], "T4": ["auto", "auto"], "3243": ["auto", "elements"]}
+    m = linked("motor")
+    assert choose_adjoint_operator(m, choose_solver(m, m.device)) == "auto"
 
 
 def run_with(budget=None, folder=None, steps=30):

@@ -15,6 +15,8 @@ MAX_REFINEMENTS = 60
 """Largest number of refinements of a solve; each gains the factor of a linear solve, or of the penalty."""
 MIN_REFINEMENTS = 3
 """Refinements before a residual that does not fall by half ends a solve: the first multipliers may raise it."""
+MAX_ORDER = 8
+"""Largest order of the extrapolation of solutions over the steps; each world takes its own."""
 
 
 @functools.cache
@@ -28,6 +30,7 @@ def adjoint_struct():
         refinements: wp.array(dtype=wp.int32)
         residual: wp.array(dtype=wp.float64)  # largest |r| / |right side| of all steps
         sums: wp.array2d(dtype=wp.float64)  # [3, world]
+        difference_sums: wp.array2d(dtype=wp.float64)  # [MAX_ORDER + 1, world] |difference|^2 of w, by order
         any_active: wp.array(dtype=wp.int32)  # [1]
         tol: wp.float64
 
@@ -44,12 +47,22 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
     mass_times, functions = mass_functions(dtype).mass_times, constraint_functions(dtype)
     module = kernel_module(f"adjoint_{dtype}{'_constrained' if constrained else ''}")
 
+    @wp.func
+    def squared_norm(free: vec3, g: vec3, diagonal: vec3) -> f64:
+        """g.D^-1 g of the free components of a slot."""
+        s = f64(0.0)
+        for k in range(3):
+            x = f64(free[k]) * f64(g[k])
+            if x != f64(0.0):
+                s += x * x / f64(diagonal[k])
+        return s
+
     @masked_kernel(module, "active")
     def residual(
         free: p.vec3_1d, con: Constraints, mul: Multipliers, mu: double_2d, rhs: p.vec3_2d, Hw: p.vec3_2d,
         diagonal: p.vec3_2d, active: int_1d, gradient: p.vec3_2d, rows: double_3d,
     ):  # fmt: skip
-        """-r = H w + J^T mu - right side, and r.D^-1 r of the free components."""
+        """-r = H w + J^T mu - right side, and r.D^-1 r of the free components, of the right side too."""
         world, slot = wp.tid()
         g = Hw[world, slot] - rhs[world, slot]
         if wp.static(constrained):
@@ -59,26 +72,30 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
                 force += (con.slot_weight[k] * mu[world, term / 3]) * mul.end_gradient[world, term]
             g += vec3(force)
         gradient[world, slot] = g
-        s = f64(0.0)
-        for k in range(3):
-            x = f64(free[slot][k]) * f64(g[k])
-            if x != f64(0.0):
-                s += x * x / f64(diagonal[world, slot][k])
-        rows[0, world, slot] = s
+        rows[0, world, slot] = squared_norm(free[slot], g, diagonal[world, slot])
+        rows[1, world, slot] = squared_norm(free[slot], rhs[world, slot], diagonal[world, slot])
 
     @wp.kernel(module=module)
-    def check_residual(ctl: Control, start: int, active: int_1d):
-        """Continue while |r| exceeds the tolerance and falls by half; `start`: |r| is that of the right side."""
+    def check_residual(ctl: Control, start: int, least_forcing: f64, forcing: double_1d, active: int_1d):
+        """Continue while |r| exceeds the tolerance and falls by half, with solves to half of the tolerance.
+
+        `start`: 1: the tolerance is relative to |r|; 2: to the right side, w being extrapolated.
+        """
         world = wp.tid()
         if active[world] == 0:
             return
         norm = wp.sqrt(ctl.sums[0, world])
         last = ctl.norm[world]
-        ctl.norm[world] = norm
         if start != 0:
-            ctl.first_norm[world] = norm
+            first = wp.where(start == 2, wp.sqrt(ctl.sums[1, world]), norm)
+            if not (norm <= first):
+                norm = first  # see `discard_extrapolation`
+            ctl.first_norm[world] = first
             ctl.refinements[world] = 0
             last = f64(1.0e300)
+        ctl.norm[world] = norm
+        target = f64(0.5) * ctl.tol * ctl.first_norm[world]
+        forcing[world] = wp.max(least_forcing, target / wp.max(norm, target))
         count = ctl.refinements[world]
         ctl.refinements[world] = count + 1
         more = norm > ctl.tol * ctl.first_norm[world] and count < MAX_REFINEMENTS
@@ -86,6 +103,66 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
             wp.atomic_max(ctl.any_active, 0, 1)
         else:
             active[world] = 0
+
+    # first iterates: w and mu extrapolated from the steps before, the sums of their differences of order 0 to n - 1
+
+    @wp.func
+    def extrapolation_order(ctl: Control, world: int) -> int:
+        """Number n of differences that the extrapolation sums: that of order n, its error, is the smallest."""
+        n = wp.int32(0)
+        for k in range(1, MAX_ORDER + 1):
+            if ctl.difference_sums[k, world] < ctl.difference_sums[n, world]:
+                n = k
+        return n
+
+    @masked_kernel(module, "active")
+    def add_differences(w: p.vec3_2d, diagonal: p.vec3_2d, active: int_1d, difference: p.vec3_3d, rows: double_3d):
+        """Backward differences of w over the steps by their order, and d.D d of each."""
+        world, slot = wp.tid()
+        d = w[world, slot]
+        for k in range(MAX_ORDER + 1):
+            x = vec3d(d)
+            rows[k, world, slot] = wp.dot(x, wp.cw_mul(vec3d(diagonal[world, slot]), x))
+            if k < MAX_ORDER:
+                before = difference[k, world, slot]
+                difference[k, world, slot] = d
+                d -= before
+
+    @masked_kernel(module, "active")
+    def extrapolate(ctl: Control, difference: p.vec3_3d, active: int_1d, w: p.vec3_2d):
+        """w of the next step."""
+        world, slot = wp.tid()
+        total = vec3()
+        for k in range(extrapolation_order(ctl, world)):
+            total += difference[k, world, slot]
+        w[world, slot] = total
+
+    @masked_kernel(module, "active")
+    def extrapolate_multipliers(ctl: Control, difference: double_3d, active: int_1d, mu: double_2d):
+        """mu of the next step, from that of the last and the differences before it."""
+        world, row = wp.tid()
+        d = mu[world, row]
+        total = f64(0.0)
+        order = extrapolation_order(ctl, world)
+        for k in range(MAX_ORDER):
+            before = difference[k, world, row]
+            difference[k, world, row] = d
+            if k < order:
+                total += d
+            d -= before
+        mu[world, row] = total
+
+    @masked_kernel(module, "active")
+    def discard_extrapolation(
+        ctl: Control, rhs: p.vec3_2d, active: int_1d, w: p.vec3_2d, mu: double_2d, gradient: p.vec3_2d
+    ):
+        """w = 0, mu = 0 where they leave more of the right side than 0."""
+        world, slot = wp.tid()
+        if not (ctl.sums[0, world] <= ctl.sums[1, world]):
+            w[world, slot] = vec3()
+            gradient[world, slot] = -rhs[world, slot]
+            for row in range(slot, mu.shape[1], w.shape[1]):
+                mu[world, row] = f64(0.0)
 
     @masked_kernel(module, "active")
     def note_residual(ctl: Control, active: int_1d):

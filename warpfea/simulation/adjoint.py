@@ -23,6 +23,7 @@ from ..base.names import did_you_mean, listing
 from ..kernels.step.step_control import STATUS
 from ..solvers import NewtonPCG
 from ..solvers.adjoint import AdjointSolver
+from ..solvers.choice import choose_adjoint_operator
 from ..terms.gradients import Gradient, StepAdjoint
 from ..terms.protocols import Differentiable
 from ..terms.shape_gradients import MESH, MeshGradient
@@ -111,6 +112,8 @@ class Adjoint(Tape):
         m, given = self.model, self.sim.solver
         keys = ("preconditioner", "preconditioner_dtype", "penalty", "operator")
         own = {key: getattr(given, key) for key in keys} if isinstance(given, NewtonPCG) else {}
+        if own.get("operator") == "auto":
+            own["operator"] = choose_adjoint_operator(m, self.sim.plan)
         options = NewtonPCG(max_pcg=MAX_PCG, max_work=MAX_WORK, max_halvings=0, **own)
         self.state = m.state()
         self.stepper = s = Stepper(
@@ -223,8 +226,8 @@ class Adjoint(Tape):
         m, a = self.model, self.solver
         self.stepper.set_dt(1.0)  # of statics; others follow
         self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
-        for array in (*a.bars.values(), a.control.residual, self.at.switches):
-            array.zero_()
+        a.begin()
+        self.at.switches.zero_()
         for term in m.terms.having(Differentiable):
             term.begin_adjoint(self.at)
 
