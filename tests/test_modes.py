@@ -183,6 +183,26 @@ def test_springs_and_dampers(kind):
     assert found.damping_ratios[mode] == pytest.approx(2.0 / (2.0 * np.sqrt(k / mass)), rel=1e-5)
 
 
+def test_a_small_part_far_from_its_joint_and_springs():
+    """1 kg of 1e-14 kg m^2, 0.5 m from a joint with a stiffness, from a ball joint that a spring holds about one axis,
+    and from a bushing: sqrt(c/(m l^2)); round-off of the weights of points was 1e-2 of it, and 0 Hz was told."""
+    for kind, stiffness, rel in (("revolute", 25.0, 1e-6), ("spherical", 0.0, 1e-6), ("bushing", 1e5, 1e-3)):
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        part = b.add_rigid(wf.Box((0.5, 0, 0), (0.1, 0.1, 0.1)), mass=1.0, inertia=(1e-14,) * 3, name="part")
+        if kind == "bushing":
+            b.add_bushing(wf.GROUND, part.at((0, 0, 0)), stiffness=(stiffness,) * 3 + (25.0,) * 3)
+        else:
+            axis = {"axis": (0, 0, 1), "stiffness": stiffness} if kind == "revolute" else {}
+            b.add_joint(kind, parent=wf.GROUND, child=part.at((0, 0, 0)), **axis)
+        if kind == "spherical":
+            b.add_spring(part.at((0.5, 0, 0)), (0.5, 1, 0), stiffness=100.0)
+        found = wf.modes(b.finalize(device="cpu"), count=3)
+        assert found.rigid_body_modes == (2 if kind == "spherical" else 0)
+        soft = found.eigenvalues[found.rigid_body_modes :][: 2 if kind == "bushing" else 1]
+        exact = 1.0 / (0.01 + 1.0 / stiffness) if kind == "bushing" else 100.0
+        assert soft == pytest.approx(exact, rel=rel), kind
+
+
 def test_material_damping():
     """Kelvin-Voigt stress eta / mu times the elastic one: C = (eta / mu) K."""
     eta, mu = 3e3, E / 2.0

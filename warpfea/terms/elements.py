@@ -23,7 +23,7 @@ from .gradients import Gradient, StepAdjoint, material_gradients
 from .protocols import Differentiable
 from .section_forces import SECTION_FIELDS, section_field
 from .shape_gradients import internal_force_gradient, mass_gradient, not_shaped
-from .term import EXPLICIT_VISCOUS, Column, StepContext, part
+from .term import EXPLICIT_VISCOUS, Column, Congruence, StepContext, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -118,9 +118,15 @@ class Elements(Differentiable):
             args = [w.data_of(block), w.u_stage, w.step.dq_dv, active, w.block_contribution]
             ctx.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)
 
-    def matrices(self, state: State, world: int) -> tuple[sp.csr_matrix, None]:
-        """The tangent; viscous forces of motions: Evaluation.viscous_force."""
-        return self.model.evaluation.tangent_matrix(state, world), None
+    def matrices(self, state: State, world: int) -> tuple[Congruence, None]:
+        """The tangent, without that of rigid parts, which constraints hold; viscous forces of motions:
+        Evaluation.viscous_force."""
+        flexible = np.ones((self.model.slots, 3))
+        for body in self.model.bodies:
+            if body.rigid:
+                flexible[body.slot_range] = 0.0
+        W = sp.diags(flexible.ravel(), format="csr")
+        return Congruence(W, self.model.evaluation.tangent_matrix(state, world)), None
 
     # adjoint
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable
 from functools import partial
 from types import SimpleNamespace
@@ -25,7 +24,7 @@ from ..model.springs import MAX_FRICTION, Bushing, SampledForce, Spring, coordin
 from .bushings import force_of_spring, set_bushing
 from .protocols import Diagnosed, Impacting, Parametrised, Preconditioned, Tied
 from .spring_gradients import DifferentiableSprings
-from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
+from .term import LOSS, NUMERICAL, STORED, WORK, Column, Congruence, StepContext, part
 from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
@@ -325,7 +324,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return {"springs": rows.numpy()[0].sum(axis=1)}
 
-    def matrices(self, state: State, world: int) -> tuple[sp.csr_matrix | None, sp.csr_matrix | None]:
+    def matrices(self, state: State, world: int) -> tuple[Congruence, Congruence]:
         """Derivatives of the forces by the positions, and by the velocities: what the tangent of a step at rest with
         dq/dv = 1 adds to that of statics."""
         m, u = self.model, state.displacement
@@ -350,22 +349,20 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
             found.append(scratch.hessian.numpy()[world].copy())
         return self._matrix(found[0]), self._matrix(found[1] - found[0])
 
-    def _matrix(self, blocks: np.ndarray) -> sp.csr_matrix:
-        """(3 slots, 3 slots) from the blocks (blocks, 3, 3) between the vectors of the items."""
-        row, column = self._entry_pairs()
+    def _matrix(self, blocks: np.ndarray) -> Congruence:
+        """From the blocks (blocks, 3, 3) between the vectors of the items."""
         sides = np.sqrt([BLOCKS[int(kind)] for kind in self.kind]).astype(int)
-        first = np.cumsum(sides**2) - sides**2
-        item = self.entry_item[row]
-        A = np.zeros((len(row), 3, 3))
-        for s, t in itertools.product(range(3), repeat=2):
-            own = np.flatnonzero(max(s, t) < sides[item])
-            of = item[own]
-            weight = self.entry_weight[row[own], s] * self.entry_weight[column[own], t]
-            A[own] += weight[:, None, None] * blocks[first[of] + sides[of] * s + t]
-        i, j = np.indices((3, 3))
-        index = (3 * self.entry_slot[row][:, None, None] + i, 3 * self.entry_slot[column][:, None, None] + j)
-        n = 3 * self.model.slots
-        return sp.csr_matrix((A.ravel(), (index[0].ravel(), index[1].ravel())), shape=(n, n))
+        item = np.repeat(np.arange(self.count), sides**2)
+        k = np.arange(len(item)) - np.repeat(np.cumsum(sides**2) - sides**2, sides**2)
+        axis = np.arange(3)
+        row, column = (9 * item + 3 * side for side in (k // sides[item], k % sides[item]))
+        index = (row[:, None, None] + axis[:, None] + 0 * axis, column[:, None, None] + axis + 0 * axis[:, None])
+        H = sp.csr_matrix((blocks.ravel(), [i.ravel() for i in index]), shape=(9 * self.count,) * 2)
+        places = (9 * self.entry_item[:, None, None] + 3 * axis[:, None] + axis,
+                  3 * self.entry_slot[:, None, None] + 0 * axis[:, None] + axis)  # fmt: skip
+        weight = np.broadcast_to(self.entry_weight[:, :, None], places[0].shape)
+        shape = (9 * self.count, 3 * self.model.slots)
+        return Congruence(sp.csr_matrix((weight.ravel(), [i.ravel() for i in places]), shape=shape), H)
 
     # in a linear solve
 

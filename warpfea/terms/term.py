@@ -124,6 +124,45 @@ class FieldSpec:
     cell_type: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class Congruence:
+    """W^T H W, not multiplied out: round-off of the product hides it where weights W, (n, 3 slots), of points far from
+    a small rigid part are large. H: (n, n). A diagonal W of 1 and 0 leaves out what constraints hold."""
+
+    W: sp.csr_matrix
+    H: sp.csr_matrix
+
+    @classmethod
+    def parts_of(cls, matrix: Any) -> list[Congruence]:
+        """A matrix, of one part, or none."""
+        if matrix is None:
+            return []
+        return [matrix] if isinstance(matrix, cls) else [cls(sp.identity(len(matrix.indptr) - 1, format="csr"), matrix)]
+
+    def restrict(self, index: np.ndarray) -> Congruence:
+        """On some components."""
+        W = self.W[:, index]
+        return Congruence(W[index], self.H[index][:, index]) if self.is_diagonal else Congruence(W, self.H)
+
+    @property
+    def is_diagonal(self) -> bool:
+        """True where H is of the components themselves."""
+        return bool(self.W.shape[0] == self.W.shape[1])
+
+    def project(self, Z: np.ndarray) -> np.ndarray:
+        """Z^T W^T H W Z."""
+        Y = self.W @ Z
+        return np.asarray(Y.T @ (self.H @ Y))
+
+    def product(self) -> sp.csr_matrix:
+        """W^T H W, of a diagonal W H."""
+        return self.H if self.is_diagonal else self.W.T @ self.H @ self.W
+
+    def size(self) -> np.ndarray:
+        """Its diagonal, of weights of at most 1."""
+        return np.asarray(self.W.minimum(1.0).maximum(-1.0).power(2).T @ np.abs(self.H.diagonal()))
+
+
 class Term:
     """One contribution to the residual. Forces in N, per slot; flags `active` are int32 arrays [world].
 
@@ -255,9 +294,9 @@ class Term:
         """STORED columns at the state, (worlds,), J, from which the ledger restarts."""
         return {}
 
-    def matrices(self, state: State, world: int) -> tuple[sp.csr_matrix | None, sp.csr_matrix | None]:
+    def matrices(self, state: State, world: int) -> tuple[Any, Any]:
         """Stiffness and damping of one world at a state at rest, (3 slots, 3 slots), N/m and N s/m, of motions small
-        about it; None: none. Terms that do not override it have no modes."""
+        about it, as CSR or `Congruence`; None: none. Terms that do not override it have no modes."""
         raise NotImplementedError
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
