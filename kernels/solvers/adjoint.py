@@ -228,6 +228,14 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
         out[world, slot] = f
 
     @masked_kernel(module, "active")
+    def gravity_rows(lumped: p.scalar_2d, ramp: double_1d, w: p.vec3_2d, active: int_1d, rows: double_3d):
+        """w times the force of gravity by each of its components."""
+        world, slot = wp.tid()
+        m = T(ramp[world]) * lumped[world % lumped.shape[0], slot]
+        for c in range(3):
+            rows[c, world, slot] = f64(m * w[world, slot][c])
+
+    @masked_kernel(module, "active")
     def density_force(
         topo: Topology, lumped: p.scalar_2d, gravity: vec3d_1d, ramp: double_1d, v: p.vec3_2d, v_tilde: p.vec3_2d,
         mass_factor: double_1d, active: int_1d, out: p.vec3_2d,

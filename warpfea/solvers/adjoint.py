@@ -216,7 +216,7 @@ class AdjointSolver:
         newton, active = w.newton, w.newton.active
         for flags in (newton.norms.component_converged, newton.floor.estimate_error, newton.solve.predicted_stress):
             flags.zero_()
-        newton.iterations.fill_(newton.max_iterations)  # factors are checked by products
+        newton.iterations.zero_()  # the solution of exact factors is taken; `_check` makes the product
         w.pcg.step_iterations.zero_()
         wp.copy(active, self.running)
         if self.symmetric or self.newton.plan.factors_operator:
@@ -268,6 +268,7 @@ class AdjointSolver:
         self.newton.preconditioner.prepare(active)
         self.linear.solve(active)
         self.newton.preconditioner.record_cost()
+        w.newton.iterations.fill_(w.newton.max_iterations)  # refinements check it
         launch(k.add_direction, self.dim, [w.direction, active, self.w])
         self._product()
         if self.constrained:

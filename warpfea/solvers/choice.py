@@ -152,10 +152,10 @@ def choose_operator(model: Model, options: NewtonPCG, kind: str, scheme: str, on
 def choose_adjoint_operator(model: Model, plan: SolverPlan) -> str:
     """Option `operator` of the adjoint of steps with a plan, whose matrix would be that of each step.
 
-    Beside banded factors kept over steps a solve takes 3 to 8 products. A matrix costs as much as 15 of T10 on one
-    core, and as 9 of beams on a GPU; that of T4, or of beams on one core, less than the solve.
+    Beside banded factors kept over steps a solve takes 3 to 8 products. A matrix of T10 costs as much as 15; one of T4
+    less than the solve, and one of beams less than their products, on a GPU too.
     """
-    cheaper = all(block.slots > 4 and (plan.on_cuda or block.with_mass) for block in model.blocks)
+    cheaper = all(block.with_mass and block.slots > 4 for block in model.blocks)
     kept = plan.preconditioner == "banded" and not model.terms.traits.constraint_rows
     return "elements" if cheaper and kept else "auto"
 

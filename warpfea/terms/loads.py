@@ -153,7 +153,7 @@ class DeadLoads(Parametrised, Differentiable):
             args = [self.model.masses.lumped_values, at.ctx.work.step.load_factor, k, at.active, at.scratch]
             at.ctx.launch(at.kernels.gravity_force, at.dim, args)
 
-        return {"gravity": lambda: ForceGradient(force)} if self.gravity_law is None else {}
+        return {"gravity": lambda: GravityGradient(force)} if self.gravity_law is None else {}
 
     def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
         slot, number, weight = (values[self._definition[1] == law] for values in self._definition)
@@ -168,6 +168,16 @@ class DeadLoads(Parametrised, Differentiable):
     def hash(self, h: Any) -> None:
         for values in self._definition:
             h.update(np.ascontiguousarray(values).tobytes())
+
+
+class GravityGradient(ForceGradient):
+    """Derivative by gravity, of its three components at once."""
+
+    def __call__(self, at: StepAdjoint, out: wp.array) -> None:
+        m, w = at.ctx.model, at.ctx.work
+        args = [m.masses.lumped_values, w.step.load_factor, at.w, at.active, w.rows]
+        at.ctx.launch(at.kernels.gravity_rows, at.dim, args)
+        at.add(out)
 
 
 @dataclass(eq=False)
