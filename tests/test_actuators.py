@@ -466,3 +466,20 @@ def test_both_devices_agree(scheme: str, dtype: str) -> None:
         sim.step(40)
         found.append([sim.joint_value(hinge), sim.joint_rate(hinge), sim.energies()["actuators"]])
     np.testing.assert_allclose(found[1], found[0], rtol=1e-5 if dtype == "float64" else 2e-2)
+
+
+def test_a_contrast_that_float32_can_not_solve_is_named_soon() -> None:
+    """Twelve links on motors of 1.4e9 N m/rad: without factors of the whole, conjugate gradients end at round-off."""
+    b = wf.ModelBuilder()
+    parent: Any = wf.GROUND
+    for k in range(12):
+        link = b.add_rigid(wf.Box((0.1 * k + 0.05, 0, 0), (0.1, 0.03, 0.03)), mass=1.0)
+        joint = b.add_joint("revolute", parent=parent, child=link.at((0.1 * k, 0, 0)), axis=(0, 1, 0), name=f"j{k}")
+        b.add_actuator(joint, wf.PD(1.44e9, 2.88e8), name=f"m{k}")
+        parent = link.at((0.1 * (k + 1), 0, 0))
+    solver = wf.NewtonPCG(preconditioner="two-level", operator="elements")
+    sim = wf.Simulation(b.finalize(device="cpu", dtype="float32"), dt=1e-2, solver=solver, integrator="bdf2")
+    with pytest.raises(wf.ConvergenceError, match=r"float32 round-off limit.*use float64"):
+        sim.step()
+    assert sim.last is not None
+    assert sim.last.pcg[0] <= 5 * solver.max_pcg  # of 200 000

@@ -171,3 +171,21 @@ def test_bad_input():
             model.set_parameter(f"m.{name}", value)
     with pytest.raises(NotImplementedError, match="weld a rigid part"):
         line.add_bushing(beam.end, wf.GROUND, stiffness=1.0)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_both_devices_agree(dtype):
+    """A cube that tumbles on a damped bushing of stiffness per world, in two worlds: its place, turn and wrench."""
+    b, part = mounted(TILTED, stiffness=(400, 500, 600, 1, 2, 3), damping=(1, 1, 1, 1e-3, 1e-3, 1e-3))
+    b.set_initial(part, velocity=(1, 0.5, 0), angular_velocity=(3, 5, 2))
+    found = []
+    for device, precision in (("cpu", "float64"), ("cuda:0", dtype)):
+        model = b.finalize(device=device, dtype=precision, worlds=2)
+        model.set_parameter("mount.stiffness", [(400, 500, 600, 1, 2, 3), (300, 200, 100, 3, 2, 1)])
+        solver = EXACT if precision == "float64" else None
+        sim = wf.Simulation(model, dt=2e-3, integrator="energy_momentum", solver=solver)
+        sim.step(40)
+        found.append([*sim.pose(part), sim.spring_force("mount")])
+    for here, there in zip(*found):
+        assert np.abs(there - here).max() < (1e-9 if dtype == "float64" else 1e-4) * np.abs(here).max()

@@ -20,8 +20,8 @@ FILES = {
     "stress_cpu.json": "cpu", "stress_h200.json": "cuda:0", "first_scenes_cpu.json": "cpu", "motors_cpu.json": "cpu",
     "mounts_cpu.json": "cpu",
 }  # fmt: skip
-MOTORS = ("pd", "stop-speed", "friction-ratio", "held-chain")
-MOUNTS = ("bushing", "fallen-part", "tube", "wheel", "fallen-roller")
+MOTORS = ("pd", "stop-speed", "friction-ratio", "held-chain", "speed")
+MOUNTS = ("bushing", "fallen-part", "tube", "wheel", "fallen-roller", "knife")
 OWN_FILES = {"first-scenes": "first_scenes_cpu.json"} | dict.fromkeys(MOTORS, "motors_cpu.json")
 OWN_FILES |= dict.fromkeys(MOUNTS, "mounts_cpu.json")
 """Cases whose rows, of minutes each or not yet run on the H200, are in files of their own."""

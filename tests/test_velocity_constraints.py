@@ -136,6 +136,20 @@ def test_a_wheel_stands_still() -> None:
         assert np.abs(sim.velocities(wheel)).max() < 1e-8
 
 
+def test_a_wheel_rolls_alike_at_any_speed() -> None:
+    """By 0.2 rad a step at 1 m/s and at 1e-5 m/s, in steps of 2e4 s: only the unit of time differs."""
+    found = []
+    for v in (1.0, 1e-5):
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        wheel = b.add_rigid(wf.Cylinder((0, -0.1, 1), (0, 0.1, 1), 1.0), mass=1.0, inertia=(0.3, 0.5, 0.3))
+        b.add_velocity_constraint("roll", wheel.at((0, 0, 1)), axis=(0, 1, 0), radius=1.0)
+        b.set_initial(wheel, velocity=(v, 0, 0), angular_velocity=(0, v, 0))
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=0.2 / v, integrator="bdf2")
+        found.append((sum(int(sim.step().newton[0]) for _ in range(30)), sim.pose(wheel)[0][0]))
+    assert found[1][0] <= found[0][0] + 2 < 120
+    assert np.abs(found[1][1] - found[0][1]).max() < 1e-9
+
+
 def motor(**options: Any) -> tuple[Any, Any]:
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     part = b.add_rigid(wf.Box((0, 0, 0), (0.1, 0.2, 0.3)), mass=1.0, inertia=(1.0, 1.0, 1.0), name="part")

@@ -312,11 +312,11 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         if is_velocity_roundoff(ctl, world):
             near = True
             settling = True
-        if wp.static(
-            traits.unilateral and traits.has_constraints
-        ):  # a part at rest on another has no energy to compare
-            below_rounding = ctl.floor.rounding_ratio[world] <= f64(1.0) and ctl.floor.eps < f64(SINGLE_PRECISION_EPS)
-            settling = settling or below_rounding
+        if wp.static(traits.has_constraints):  # a part at rest on another, or in free flight, has no energy to compare
+            bare = ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
+            if wp.static(traits.unilateral):
+                bare = not bare
+            settling = settling or (bare and ctl.floor.rounding_ratio[world] <= f64(1.0))
         near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         still = ctl.norms.residual_reduction[world] > f64(STALL_RATIO) and ctl.solve.operator_reused[world] == 0
         if ctl.norms.ratio[world] <= f64(1.0):

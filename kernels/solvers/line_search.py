@@ -128,6 +128,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             # one group's forces may dwarf those of the unconverged groups
             ratio = ctl.norms.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
         ctl.norms.residual_reduction[world] = ratio
+        if ratio <= f64(0.5):
+            ctl.solve.stalled_solves[world] = 0
         eta = f64(0.9) * ratio * ratio
         # the fall of a quadratic force tells nothing of the convergence
         eta = wp.where(ctl.search.alpha[world] > f64(wp.static(longest)), f64(0.1), eta)

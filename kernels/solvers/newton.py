@@ -77,6 +77,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.solve.pcg_unconverged[world] = 0
         ctl.solve.met_negative_curvature[world] = 0
         ctl.solve.count[world] = 0
+        ctl.solve.stalled_solves[world] = 0
         ctl.floor.error_estimate[world] = f64(1.0e30)
         ctl.search.slope[world] = f64(0.0)
         if wp.static(traits.unilateral):
@@ -277,6 +278,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         if wp.static(traits.limited):
             ctl.search.alpha[world] = wp.min(ctl.search.limit[world], f64(1.0))
         ctl.solve.count[world] = ctl.solve.count[world] + 1
+        ctl.solve.stalled_solves[world] = (ctl.solve.stalled_solves[world] + 1) * ctl.solve.pcg_unconverged[world]
         ctl.search.trials[world] = 0
         ctl.search.doublings[world] = wp.where(ctl.solve.negative_curvature[world] != 0 and ctl.is_static != 0, 0, -1)
         if wp.static(traits.unilateral):
@@ -299,6 +301,8 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             wp.atomic_max(ctl.any_rare_branch, 0, 1)
         elif pcg.step_iterations[world] >= pcg.max_work:
             convergence.give_up(ctl, world, Failure.WORK)
+        elif ctl.solve.max_stalled_solves > 0 and ctl.solve.stalled_solves[world] >= ctl.solve.max_stalled_solves:
+            convergence.give_up(ctl, world, Failure.ROUNDOFF)
         elif (
             ctl.solve.count[world]
             > MAX_SOLVES_PER_ITERATION * convergence.iteration_factor(ctl, world) * ctl.max_iterations

@@ -99,7 +99,7 @@ def control_struct():
         unconverged_tol: d1  # smallest accepted norm among them
         group_sums: wp.array3d(dtype=wp.float64)  # [GROUP_ROWS, world, residual group]; if there are several
         component_converged: wp.array2d(dtype=wp.int32)  # [world, component] converged
-        violation: d2  # [world, component] largest |c|, m; with constraints
+        violation: d2  # [world, component, and one more] `Multipliers.violation`; with constraints
         violation_ratio: d1  # largest violation over its tolerance; with constraints
         residual_history: d2  # [world, iteration] relative residual
 
@@ -147,6 +147,8 @@ def control_struct():
         negative_curvature: i1  # the last solve met a direction without positive curvature
         met_negative_curvature: i1  # a solve of this attempt did
         pcg_unconverged: i1  # the last solve for a step ended at `max_iterations`
+        stalled_solves: i1  # successive solves that did and whose steps did not halve the residual
+        max_stalled_solves: wp.int32  # of them, in single precision, after which round-off is told; 0: any number
 
     @wp.struct
     class FrozenQuantities:  # quantities of terms that a line search freezes; with unilateral forces

@@ -349,10 +349,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if step.growth_monitored != 0:
             report[world, 14] = step.energy_growth[world, GROWTH_SHARE]
         if wp.static(traits.has_constraints):
-            largest = f64(0.0)
-            for c in range(newton.norms.component_count):
-                largest = wp.max(largest, newton.norms.violation[world, c])
-            report[world, 9] = largest
+            report[world, 9] = newton.norms.violation[world, newton.norms.component_count]
             report[world, 10] = f64(newton.multiplier_updates[world])
 
     @wp.kernel(module=module)

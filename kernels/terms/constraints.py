@@ -42,6 +42,8 @@ VELOCITY = 1 << 30
 """Kind of rows at the level of velocities, see velocity_rows.py."""
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
+SINGLE_ROUNDING = 2.0**-23
+"""Round-off of positions in float32."""
 MAX_DRIVE_ROTATION = 1.0
 """Largest change of a driven angle in a substep, rad: a larger one may crush a body instead of turning it."""
 
@@ -106,7 +108,8 @@ def multiplier_struct():
         product: wp.array2d(dtype=wp.vec3d)  # [world, term] contributions to H p
         curvature: wp.array2d(dtype=wp.mat33d)  # [world, 9 row + 3 side + other] d2c / (d vector d other), by formulas
         rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, row] of the potential, J
-        violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m
+        # [world, component] largest |c| above round-off, m; in a last column that of all rows
+        violation: wp.array2d(dtype=wp.float64)
         stiffest: wp.array2d(dtype=wp.float64)  # [world, component] largest stiffness of rows, 1 / (J D^-1 J^T)_ii
         compliance_block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1 over common slots
         inverse_matrix: wp.array2d(dtype=wp.float64)  # [world, entry] of clusters: (1 / (dq/dv rho) + J D^-1 J^T)^-1
@@ -116,6 +119,7 @@ def multiplier_struct():
         deflation_solution: wp.array2d(dtype=wp.float64)  # inverse matrix times J D^-1 r, by sweeps
         outer_updates: wp.int32  # 1: multipliers change in the outer loop only
         penalty_ratio: wp.float64  # kappa, rho over the stiffness of the constrained slots
+        rounding_limit: wp.float64  # m, largest violation that may be round-off of positions, in float32
         chain_ratio: wp.float64  # least rho over the stiffness of the stiffest row of a component, or 0
 
     return Multipliers
@@ -221,7 +225,9 @@ def constraint_functions(dtype: str) -> KernelSet:
         mul.rows[0, world, row] = frozen * c + penalty_energy
         mul.rows[1, world, row] = new * c + penalty_energy
         mul.rows[2, world, row] = wp.max(wp.abs(frozen), wp.abs(new)) * size + penalty_energy
-        wp.atomic_max(mul.violation, world, con.connected_component[row], wp.abs(c))
+        wp.atomic_max(mul.violation, world, mul.violation.shape[1] - 1, wp.abs(c))
+        if wp.abs(c) > wp.min(f64(SINGLE_ROUNDING) * size, mul.rounding_limit):
+            wp.atomic_max(mul.violation, world, con.connected_component[row], wp.abs(c))
 
     return kernel_set(locals())
 
@@ -259,14 +265,9 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
 
     @wp.kernel(module=module)
     def evaluate(
-        con: Constraints,
-        u: p.vec3_2d,
-        u_stage: p.vec3_2d,
-        law_value: vec3d_2d,
-        alpha: double_1d,
-        active: int_1d,
+        con: Constraints, u: p.vec3_2d, u_stage: p.vec3_2d, law_value: vec3d_2d, alpha: double_1d, active: int_1d,
         mul: Multipliers,
-    ):
+    ):  # fmt: skip
         """c at u, its gradients at u_stage; multipliers of the trial step; the rows of the augmented potential."""
         world, row = wp.tid()
         kind = con.kind[row]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.checks import is_number
 from ..base.errors import ModelError
-from ..elements.rigid import RIGID, TRIANGLE_SIDES, deviations_through
+from ..elements.rigid import NOMINAL_PERIOD, RIGID, TRIANGLE_SIDES, deviations_through
 from ..materials import SVK, Material
 from ..mesh import Mesh
 from ..mesh.cells import TET_FACES
@@ -23,11 +23,8 @@ __all__ = ["make_rigid"]
 TRIANGLE_ROUND_OFF = 1e-9
 """Largest violation of the triangle inequality of principal inertias, over the largest; half of the inertia of a rod
 about its axis."""
-NOMINAL_PERIOD = 1e-2
-"""Time, s, in which a wave would pass the element whose strains are constrained to zero: its stiffness scales the
-system of a part that is held by others, and acts on no motion."""
 CONTACT_PERIOD = 1e-3
-"""The same for the stiffness of contact of a part without a material on obstacles."""
+"""Time, s, in which a wave would pass a part without a material: its stiffness in contact with obstacles."""
 MIN_SPREAD = 0.05
 """Least radius of gyration of the four points over the largest."""
 TETRAHEDRON = np.array([(1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)])

@@ -9,11 +9,13 @@ from .family import EnergyPart, Family, VtkSubdivision, register
 from .lagrange import TET_CORNERS, TET_FACE_CORNERS
 from .quadrature import TET_RULES, triangle_6
 
-__all__ = ["RIGID", "TRIANGLE_SIDES", "deviations_through"]
+__all__ = ["NOMINAL_PERIOD", "RIGID", "TRIANGLE_SIDES", "deviations_through"]
 
 TRIANGLE_SIDES = ((0, 1), (1, 2), (2, 0))
 
-
+NOMINAL_PERIOD = 1e-2
+"""Time, s, in which a wave would pass the element whose strains are constrained to zero: its stiffness scales the
+system of a part that is held by others, and acts on no motion. In longer steps the time is theirs."""
 NOMINAL_SOFTNESS = 1e-2
 """Modulus of the element over that of a part's material for contact, where the part has none of its own."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.solvers import newton_control as codes
 from ..kernels.solvers.convergence import STALL_ROUNDINGS
+from ..kernels.terms.constraints import SINGLE_ROUNDING
 from ..model.assembly import element_volumes
 from ..model.contact_points import effective_modulus
 from ..solvers import NewtonPCG
@@ -102,7 +103,7 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     direct = sim.stepper.newton.direct
     if code == codes.Failure.CURVATURE and direct is not None and world in direct.singular_worlds:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
-    near = float(work.newton.floor.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
+    near = _is_near_round_off(sim, world)
     parts = all(getattr(body, "rigid", False) for body in sim.model.bodies)
     finer = "; check the units, and inertias beside mass times size^2" if parts else (
         "; use fewer, stouter elements, or check the units")  # fmt: skip
@@ -140,6 +141,16 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
             "; follow the post-critical path by damped dynamics or displacement control"
         )
     return FAILURE_REASONS.get(code, "unknown reason"), smaller
+
+
+def _is_near_round_off(sim: Any, world: int) -> bool:
+    """True if the residual, or in float32 a violation of constraints, may be round-off of the positions."""
+    work = sim.stepper.work
+    if float(work.newton.floor.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS:
+        return True
+    if sim.model.dtype == "float64" or sim.model.constraints is None:
+        return False
+    return bool(sim.stepper.newton.constraint_tol < SINGLE_ROUNDING * np.abs(work.u.numpy()[world]).max())
 
 
 def _step_text(sim: Any, time: float, world: int) -> str:

@@ -269,6 +269,7 @@ class Simulation:
         self._dt = float(value) if one else None
         self.statistics.times_differ |= not one
         self.stepper.set_dt(self._dt if one else value)
+        self.stepper.work.limit_rigid_stiffness(None if self.integrator.static else self._dt)
 
     @property
     def t_end(self) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.launch import launch_part
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
+from ..kernels.solvers.convergence import MAX_ERROR_ESTIMATES
 from ..kernels.solvers.newton import newton_kernels
 from ..kernels.solvers.newton_control import FLOOR_LANES
 from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
@@ -202,6 +203,7 @@ class NewtonLoop:
         self.max_outer = options.max_outer
         penalty_ratio = options.penalty_ratio(model)
         ctx.options = TermOptions(self.outer_multipliers, penalty_ratio, plan.deflates_constraints)
+        work.newton.floor.max_error = MAX_ROUND_OFF_ERROR[model.dtype]
         self.terms.call(ctx, Constrained, "configure")
         self.residual = Residual(ctx, plan)
         self.direct = DirectSolver(ctx, self.residual) if plan.linear == "direct" else None
@@ -217,16 +219,15 @@ class NewtonLoop:
         self.dim = (model.worlds, model.slots)
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
-        ctl.solve.first_forcing = plan.first_forcing
-        ctl.solve.fixed_forcing = int(options.forcing is not None)
-        ctl.norms.force_tol = options.force_tol
-        ctl.norms.tol = options.tolerance(model.dtype)
+        ctl.solve.first_forcing, ctl.solve.fixed_forcing = plan.first_forcing, int(options.forcing is not None)
+        ctl.norms.force_tol, ctl.norms.tol = options.force_tol, options.tolerance(model.dtype)
         ctl.floor.eps = MACHINE_EPSILON[model.dtype]
-        ctl.is_static = int(not inertia)
-        ctl.model_size = float(model.size)
+        # in exact arithmetic conjugate gradients end after as many iterations as there are unknowns
+        spent = model.dtype == "float32" and self.direct is None and options.max_pcg >= 3 * model.slots
+        ctl.solve.max_stalled_solves = MAX_ERROR_ESTIMATES if spent else 0
+        ctl.is_static, ctl.model_size = int(not inertia), float(model.size)
         ctl.norms.component_of_group = model.components.residual_groups.component
         ctl.max_iterations = options.max_newton
-        ctl.floor.max_error = MAX_ROUND_OFF_ERROR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
         ctl.linear_stress = int(all(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks))
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
@@ -237,8 +238,7 @@ class NewtonLoop:
         if ctx.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
             ctl.norms.constraint_acceleration_tol = max(constraint_tol / model.size, ctl.norms.tol) * ACCELERATION_SCALE
             ctl.norms.constraint_tol_min = MIN_CONSTRAINT_TOL * model.size
-        # in double precision round-off is far below the errors for which steps are rejected; forces at a mid-point are
-        # not those of the positions
+        # double precision has no such round-off; forces at a mid-point are not those of the positions
         self.perturbation_kernels = None
         if model.dtype == "float32" and not ctx.midpoint:
             self.perturbation_kernels = perturbation_kernels(model.dtype)

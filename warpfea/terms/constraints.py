@@ -101,8 +101,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("gradient", "end_gradient", "product"), (B, 3 * M))
         shapes |= {
             "curvature": (B, 9 * M),
-            "violation": (B, self.model.components.count),
-            "stiffest": (B, self.model.components.count),
+            **dict.fromkeys(("violation", "stiffest"), (B, self.model.components.count + 1)),
             "compliance_block": (B, max(con.block_count, 1)),
             "inverse_matrix": (B, con.matrix_entries),
             "coupling": (B, max(con.coupling_count, 1)),
@@ -135,6 +134,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         mul, options = ctx.work.multipliers, ctx.options
         mul.outer_updates, mul.penalty_ratio = int(options.outer_multipliers), options.penalty_ratio
         chains = self.model.dtype == "float64" and any(body.rigid for body in self.model.bodies)
+        if self.model.dtype == "float32":
+            mul.rounding_limit = ctx.work.newton.floor.max_error * self.model.size
         mul.chain_ratio = CHAIN_SHARE * options.penalty_ratio if chains else 0.0
         if options.deflate_constraints:
             self.large = self.tables.clusters_above(MAX_THREAD_ROWS)
@@ -163,8 +164,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
     @part("constraints")
     def force(self, ctx: StepContext, active: wp.array) -> None:
         """Evaluate c, J and the rows of the augmented potential at work.u."""
-        m, w, k = self.model, ctx.work, self.integrator_kernels(ctx)
-        ctx.launch(k.reset_violation, (m.worlds, m.components.count), [active, w.multipliers])
+        w, k = ctx.work, self.integrator_kernels(ctx)
+        ctx.launch(k.reset_violation, w.multipliers.violation.shape, [active, w.multipliers])
         args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.search.alpha, active, w.multipliers]
         start = ctx.state.displacement if ctx.midpoint else w.q_tilde
         more = [w.time_law_stage_values, w.newton.search.alpha, active, w.multipliers]

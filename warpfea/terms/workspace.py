@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from operator import attrgetter, methodcaller
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.memory import convert_memory_errors
+from ..elements.rigid import NOMINAL_PERIOD
 from ..kernels.common.lanes import WARP_SIZE
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
@@ -29,6 +31,11 @@ if TYPE_CHECKING:
 __all__ = ["Workspace"]
 
 
+def _own_data(own: Mapping[Block, Any], of_others: Callable[[Block], Any], block: Block) -> Any:
+    """Constants of a block: its own in a simulation, or those of the model."""
+    return own[block] if block in own else of_others(block)
+
+
 class Workspace:
     """Scratch of a simulation. Unused features get an array of one item.
 
@@ -44,6 +51,11 @@ class Workspace:
         self.data_of: Callable[[Block], Any] = attrgetter("data")
         if dissipation:
             self.data_of = methodcaller("dissipative_data", model.dtype, dissipation)
+        # weights of the elements of rigid parts, for `limit_rigid_stiffness`, and those of the model
+        self.rigid_weights: list[tuple[wp.array, np.ndarray]] = []
+        own = {b: self._with_own_weights(self.data_of(b)) for b in model.blocks if b.host_blocks[0].body.rigid}
+        if own:
+            self.data_of = partial(_own_data, own, self.data_of)
         self.bytes: dict[str, int] = {}
         # arrays for a chunk of the worlds: chunk size as a function of the number of worlds
         self.chunks: dict[str, Callable[[int], int]] = {}
@@ -162,6 +174,21 @@ class Workspace:
             of_step = name in ("mass_factor", "dq_dv")
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
         self.stage = self.iterate(self.u_stage, self.v_stage, self.step.dq_dv)
+
+    def _with_own_weights(self, data: Any) -> Any:
+        """Copy of the constants of a block of rigid parts whose weights change with the step."""
+        out = data._cls()
+        for name in data._cls.vars:
+            setattr(out, name, getattr(data, name))
+        out.quadrature_weight = wp.clone(data.quadrature_weight)
+        self.rigid_weights.append((out.quadrature_weight, data.quadrature_weight.numpy()))
+        return out
+
+    def limit_rigid_stiffness(self, h: float | None) -> None:
+        """Limit the stiffness of the elements of rigid parts to about their mass over h^2 in steps of h, s, of all
+        worlds: much more would hide motions by its round-off. None: the whole."""
+        for own, whole in self.rigid_weights:
+            own.assign(whole * (1.0 if h is None else min(1.0, (NOMINAL_PERIOD / h) ** 2)))
 
     def iterate(self, u: wp.array, v: wp.array, dq_dv: wp.array, worlds: slice = slice(None)) -> Any:
         """Struct of the arrays of some worlds from which element kernels evaluate an iterate."""

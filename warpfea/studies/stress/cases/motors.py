@@ -68,6 +68,22 @@ def stop_speed(setting: Setting, value: tuple[float, float]) -> Answer:
     return _row_answer(sim, stats, over, 0.02, "energy of the impact")
 
 
+@case("speed", "motors", values=[(inertia, rate, scheme) for inertia, rate in ((1e-9, 1e4), (1.0, 1e-6), (1e9, 1e2))
+                                 for scheme in ("energy_momentum", "bdf2")],
+      quick="float64", refusal=FLOAT32_REFUSAL)  # fmt: skip
+def speed(setting: Setting, value: tuple[float, float, str]) -> Answer:
+    """A drive takes so much inertia, kg m^2, to a rate, rad/s, in 3 rad and 50 steps, the last of 0.12 rad: the time is
+    T = 6/rate, the torque I rate/T."""
+    inertia, rate, scheme = value
+    b, joint = _wheel(inertia, 0.0)
+    T = 6.0 / rate
+    b.add_velocity_constraint("speed", joint, value=([0.0, T], [0.0, rate]), name="motor")
+    sim, stats = step(b, setting, 50, dt=0.02 * T, integrator=scheme)
+    torque = sim.joint_force("motor")[0, 5] / (inertia * rate / T)
+    found = np.array([sim.joint_value(joint)[0] / 3.0, sim.joint_rate(joint)[0] / rate, torque])
+    return _row_answer(sim, stats, float(np.abs(found - 1.0).max()), 5e-2, "I rate / T")
+
+
 @case("friction-ratio", "motors", values=(1e-6, 1.0, 1e6), quick="float64", refusal=FLOAT32_REFUSAL)
 def friction_ratio(setting: Setting, value: float) -> Answer:
     """A wheel of so much inertia is stopped by friction of 2 N m per kg m^2 from 1 rad/s, and stays at 0.25 rad."""

@@ -82,6 +82,30 @@ def wheel(setting: Setting, value: tuple[float, float, str]) -> Answer:
     return stats.answer(error, 1e-3 if setting.single else 1e-7, "its line and energy", lowest_J=None)
 
 
+@case("knife", "mounts", values=[(m, v, turn, scheme) for m, v in ((1e-6, 1e3), (1.0, 1e-3), (1e6, 10.0)) for turn,
+                                 scheme in ((0.02, "energy_momentum"), (0.2, "bdf2"))],
+      quick="float64", refusal=FLOAT32_REFUSAL)  # fmt: skip
+def knife(setting: Setting, value: tuple[float, float, float, str]) -> Answer:
+    """Chaplygin's sleigh of m kg, its centre a = 0.3 m before the edge, from a turn about the edge at v m/s, by a turn
+    per step, rad: with k^2 = I/m + a^2 and p = a v t/k^2 its heading is k/a gd(p), the edge's speed v tanh p."""
+    mass, v, turn, scheme = value
+    a, k = 0.3, np.sqrt(0.25 + 0.09)
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    part = b.add_rigid(wf.Box((a, 0, 0), (0.6, 0.2, 0.1)), mass=mass, inertia=(0.15 * mass, 0.2 * mass, 0.25 * mass),
+                       com=(a, 0, 0), name="sleigh")  # fmt: skip
+    edge = part.at((0, 0, 0))
+    b.add_velocity_constraint("knife", edge, axis=Y)
+    b.add_probe("edge", edge)
+    b.set_initial(part, velocity=(0, a * v / k, 0), angular_velocity=(0, 0, v / k))
+    sim, stats = step(b, setting, 60, dt=turn * k / v, integrator=scheme)
+    p = a / k * 60 * turn
+    z, w = sim.pose(part)[1][0, 2:]
+    heading = 2.0 * np.arctan2(float(z), float(w))
+    ahead = float(sim.probe("edge").velocity[0, -1] @ (np.cos(heading), np.sin(heading), 0.0))
+    error = max(abs(heading / (2.0 * k / a * np.arctan(np.tanh(0.5 * p))) - 1.0), abs(ahead / (v * np.tanh(p)) - 1.0))
+    return stats.answer(error, 2e-2 if turn > 0.1 else 1e-3, "k/a gd(a v t/k^2)", lowest_J=None)
+
+
 @case("fallen-roller", "mounts", values=[("cylinder", 0.0), ("cylinder", 1e-9), ("cylinder", 0.7), ("capsule", 1e-3)],
       quick="float64", refusal=FLOAT32_REFUSAL)  # fmt: skip
 def fallen_roller(setting: Setting, value: tuple[str, float]) -> Answer:
