@@ -251,10 +251,11 @@ def modes(
 
 
 def buckling(model: Model, state: State, *, count: int = 1, world: int = 0) -> Buckling:
-    """Linear buckling: K(0) + factor (K(u) - K(0)) is singular.
+    """Linear buckling: K(0) + factor K_G is singular, K_G the geometric stiffness of the state's stress and joint
+    forces at rest.
 
     Args:
-        state: equilibrium under a small part of the load, such as of `solve_static(model).state`, so small that its
+        state: equilibrium under a part of the load, such as of `solve_static(model).state`, so small that its
             displacements are linear in the load.
         count: number of buckling modes, those of the smallest positive factors.
         world: the world.
@@ -268,6 +269,8 @@ def buckling(model: Model, state: State, *, count: int = 1, world: int = 0) -> B
     start.displacement.zero_()
     system = _linearise("buckling", model, start, count, world)
     G = system.K - loaded.K
+    before, after = (model.evaluation.tangent_matrix(at, world) for at in (start, state))
+    G = G + system.restrict(after - before - model.evaluation.stress_stiffness(state, world))  # the turn would soften
     if len(system.index) <= MAX_DENSE:
         Z = system.null_space()
         try:

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Evaluation", "lowest_jacobian"]
 
+SMALL_TURN = 1e-3
+"""Factor of skew changes in `stress_stiffness`, whose square is the relative error."""
+
 
 class Evaluation:
     """Evaluation of a model at a state; allocates its arrays at each call."""
@@ -159,9 +162,42 @@ class Evaluation:
 
     def tangent_matrix(self, state: State, world: int) -> sp.csr_matrix:
         """df_int/dq as CSR, by one product per colour and axis; no element has two slots of one colour."""
-        m = self.model
         row = state.displacement.numpy()[world : world + 1]
-        ctx = self._step_context(wp.array(row, dtype=m.types.vec3, device=m.device))
+        return self._assemble(self._step_context(self._row(row)), self.elements.tangent, world)
+
+    def stress_stiffness(self, state: State, world: int) -> sp.csr_matrix:
+        """Geometric stiffness at rest of the second Piola-Kirchhoff stress of small displacements u.
+
+        A predicted stress lacks C : d^T d / 2 of the last change d, and S''(d, d) / 2: those of u. With d = V X + a V u
+        and V X - a V u the difference is 2 a C : sym(V^T V du/dX), and S'' cancels where V is skew and d and -d count.
+        Products of that kind give the sum of all without the turn of the elements.
+        """
+        m = self.model
+        u = state.displacement.numpy()[world : world + 1].astype(float)
+        place = m.slot_table.reference[None]
+        a = np.abs(place).max() / (np.abs(u).max(initial=0.0) or 1.0)
+        turns = [np.eye(3)]
+        if any(block.key.law not in DEFINED_FOR_ANY_J for block in m.blocks):
+            turns = [np.cross(axis, np.eye(3)) for axis in SMALL_TURN * np.concatenate([np.eye(3), -np.eye(3)])]
+        share = 0.5 / (a * sum(np.trace(V.T @ V) for V in turns) / 3.0)
+        steps = [((place + sign * a * u) @ V.T, -sign * share) for V in turns for sign in (1.0, -1.0)]
+        out = sp.csr_matrix((3 * m.slots, 3 * m.slots))
+        for step, factor in [*steps, (0.0 * u, 1.0), (u, -1.0)]:
+            ctx = self._step_context(self.zeros((1, m.slots), m.types.vec3))
+            stage = ctx.work.stage
+            stage.v, stage.base = self._row(step), ctx.work.u
+            stage.use_prediction = wp.ones(1, dtype=wp.int32, device=m.device)
+            work: Any = ctx.work
+            work.v, work.step, work.iterate = stage.v, stage, lambda *_, stage=stage: stage
+            out = out + factor * self._assemble(ctx, self.elements.predicted_stress_tangent, world)
+        return out
+
+    def _row(self, values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=self.model.types.vec3, device=self.model.device)
+
+    def _assemble(self, ctx: StepContext, product: Any, world: int) -> sp.csr_matrix:
+        """Matrix of the products of elements at a context of one world."""
+        m = self.model
         direction = self.zeros((1, m.slots), m.types.vec3)
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         conns = [b.connectivity for b in m.blocks]
@@ -173,7 +209,7 @@ class Evaluation:
                 host[0, colour == c, axis] = 1.0
                 direction.assign(host)
                 with m.parameters.temporarily_restricted_to_worlds(world, world + 1):
-                    self.elements.tangent(ctx, direction, flag)
+                    product(ctx, direction, flag)
                 out = ctx.work.contribution.numpy()[0]
                 for block, conn in zip(m.blocks, conns):
                     part = out[block.contribution_offset :][: block.count * block.slots]
