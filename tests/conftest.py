@@ -79,7 +79,12 @@ COSTLY = set((Path(__file__).parent / "data/slow.txt").read_text().splitlines())
 """Tests with kernel modules or steps of their own, most CPU time first until the rest met its limit: slow, too."""
 
 
+PROCESSES = {"test_sweep_study.py", "test_sweep.py", "test_torch.py"}
+"""Files whose slow tests take longest and wait for processes: first, so that no core is idle at the end."""
+
+
 def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.name not in PROCESSES)
     for item in items:
         if item.nodeid in COSTLY:
             item.add_marker(pytest.mark.slow)

@@ -191,7 +191,7 @@ slow = "{MODELS}:slow_fall"
 [run]
 device = "cpu"
 [engine]
-worlds = 4
+worlds = 8
 """
 
 
