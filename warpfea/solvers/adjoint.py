@@ -49,6 +49,9 @@ class ExactOperator:
             table["contribution"] = w.nonpotential_tangent
             self.product_terms = with_fields(product_terms_struct(m.dtype), residual.product_terms, **table)
         self.kernels = gather_kernels(m.dtype, traits._replace(tangent=traits.nonpotential))
+        self.residual, self.clusters = residual, residual.clusters
+        if not residual.elements.is_symmetric(self.ctx):
+            self.clusters = None
 
         self.without_mass = with_fields(product_terms_struct(m.dtype), self.product_terms)
         self.without_mass.mass_factor = wp.zeros(m.worlds, dtype=wp.float64, device=m.device)
@@ -56,18 +59,23 @@ class ExactOperator:
     def product(
         self, p: wp.array, out: wp.array, active: wp.array, topology: Any = None, *, start: bool = False
     ) -> None:  # fmt: skip
-        """out = H p, on the free components of a topology, by default those of the model.
+        """out = H p, on the free components of a topology, by default those of the model; p is 0 elsewhere then.
 
         `start`: (dq/dv) K p with the derivative K of the forces of a mid-point scheme by the start of the step.
         """
         ctx = self.ctx
         m, w, launch = ctx.model, ctx.work, ctx.launch
+        clusters = None if topology else self.clusters
         for term in m.terms.having(Differentiable):
-            term.exact_product(ctx, p, active, transposed=self.transposed, start=start)
+            if clusters and term is self.residual.elements:
+                self.residual.cluster_products(p, active)
+            else:
+                term.exact_product(ctx, p, active, transposed=self.transposed, start=start)
         terms = self.without_mass if start else self.product_terms
-        args = [topology or m.topology, w.contribution, terms, p, active, self.constraint_data]
+        args = [clusters.topology if clusters else topology or m.topology, w.contribution, terms, p, active]
+        total = self.kernels.with_mass_sum if clusters else self.kernels.operator_product
         size = (m.worlds, launch.padded(m.slots))
-        launch(self.kernels.operator_product, size, [*args, w.multipliers, out, w.warp_rows])
+        launch(total, size, [*args, self.constraint_data, w.multipliers, out, w.warp_rows])
 
 
 class AdjointSolver:

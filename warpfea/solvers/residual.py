@@ -250,16 +250,22 @@ class Residual:
         args += [w.diagonal, w.inverse]
         launch(self.gather_kernels.gather_diagonal_blocks, self.dim, args)
 
+    def cluster_products(self, p: wp.array, active: wp.array) -> None:
+        """H p of the clusters of elements, with their mass, to be summed by `with_mass_sum`."""
+        m, w = self.model, self.work
+        assert self.clusters is not None
+        for block, kernel, (data, count) in zip(m.blocks, self.product_kernels, self.clusters.blocks):
+            lanes = block.cluster_size if m.device.is_cuda else 1
+            args = [w.data_of(block), data, w.stage, w.step.mass_factor, active, p]
+            args += [lanes, self.cluster_memory, w.contribution]
+            self.launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
+
     @launch_part("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate; partial sums of p.Hp in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.clusters:
-            for block, kernel, (data, count) in zip(m.blocks, self.product_kernels, self.clusters.blocks):
-                lanes = block.cluster_size if m.device.is_cuda else 1
-                args = [w.data_of(block), data, w.stage, w.step.mass_factor, active, p]
-                args += [lanes, self.cluster_memory, w.contribution]
-                launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
+            self.cluster_products(p, active)
         elif self.uses_predicted_stress:
             self.elements.predicted_stress_tangent(self.ctx, p, active)
         elif not self.uses_matrix:
