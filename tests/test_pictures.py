@@ -149,7 +149,6 @@ def test_renderer_far_from_the_origin():
 def test_rasterized_faces_are_those_that_rays_meet():
     """Nearest of triangles at samples by their weights; a picture by it is that of rays, which sections need."""
     import warp as wp
-
     from warpfea.kernels.outputs import raycast
 
     random = np.random.default_rng(0)
@@ -276,6 +275,9 @@ def test_long_names_and_extremes_at_the_border_stay_in_the_picture(tmp_path, mon
     monkeypatch.setattr(Overlay, "draw", lambda self, *more: told.append(self) or draw(self, *more))
     drive(sim, PNGWriter(tmp_path / "x.png", size=(240, 135), legend=True), 3)
     assert sorted(len(text) for text, _, _ in told[0].texts) == [7, 40]
+    for spacing in (1.0, 3.0):  # of several worlds names are drawn in the first one
+        drive(StubSim(worlds=2), PNGWriter(tmp_path / "x.png", size=(64, 64), legend=True, spacing=spacing), 1)
+    assert told[1].texts[0][1][0] - told[2].texts[0][1][0] == pytest.approx(1.0)
     camera = Camera.framing(np.eye(3), view=(0, 0), aspect=1.0)
     corner = next(p for p in np.linspace((0, -9, 0), (0, 9, 0), 999) if 60 < camera.project(p, (64, 64))[0] < 63)
     image = Image.new("RGB", (200, 64))

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warpfea as wf
+from warpfea.outputs.frames import field_label
 
 AREA, RHO = 0.05 * 0.05, 1000.0
 LAW = wf.SVK(E=1e9, nu=0.0, density=RHO)
@@ -98,6 +99,7 @@ def test_rotating_bar():
     omega = np.linalg.norm(sim.velocities(beam)[0, 0]) / 0.5
     s = np.linspace(-0.5, 0.5, 5)
     exact = RHO * AREA * omega**2 * (0.25 - s**2) / 2
+    assert [field_label(sim, f"section_force.{name}")[1] for name in ("Qz", "T")] == ["N", "N m"]
     found = sim.field("section_force", beam)[0]
     assert found[:, 0] == pytest.approx(exact, abs=1e-2 * exact.max())
     assert found[[0, -1]] == pytest.approx(0.0, abs=1e-6 * exact.max())

@@ -60,6 +60,7 @@ class Animation:
         rest: (P, 3) points at rest; edges: (E, 2) points along edges of elements, of bodies; None: not known.
         mark_kinds: of the points of marks of frames. label: text in place of the time of a frame.
         by_body: each body has its colour where there is no field.
+        worlds: number of worlds in each part.
     """
 
     triangles: npt.NDArray[np.integer[Any]]
@@ -78,6 +79,7 @@ class Animation:
     mark_kinds: list[str] = field(default_factory=list)
     label: str = ""
     by_body: bool = False
+    worlds: int = 1
     frames: list[Frame] = field(default_factory=list)
 
     def draw(
@@ -209,7 +211,8 @@ class Animation:
             for name, first, count in self.parts:
                 if first < n and name not in look.hide:
                     short = name if len(name) <= MAX_NAME else f"{name[: MAX_NAME - 3]}..."
-                    out.texts.append((short, points[first : first + count].mean(axis=0), False))
+                    one = points[first : first + count // self.worlds]  # in the first world
+                    out.texts.append((short, one.mean(axis=0), False))
         if look.extremes and frame.values is not None and np.isfinite(frame.values).any():
             for what, find in (("min", np.nanargmin), ("max", np.nanargmax)):
                 k = int(find(frame.values))

@@ -26,10 +26,16 @@ Array = npt.NDArray[Any]
 
 
 def field_label(sim: Any, name: str) -> tuple[str, str]:
-    """(title, units) of a field; one that the simulation lacks is its own title, without units."""
+    """(title, units) of a field; one that the simulation lacks is its own title, without units. Units told apart by
+    commas are of equal shares of the components."""
     whole, _, part = name.partition(".")
     spec = sim.fields.get(whole)
-    return (f"{spec.title} {part}".rstrip(), spec.units) if spec else (name.replace("_", " "), "")
+    if spec is None:
+        return name.replace("_", " "), ""
+    units = spec.units.split(", ")
+    if part in spec.components:
+        units = [units[spec.components.index(part) * len(units) // len(spec.components)]]
+    return f"{spec.title} {part}".rstrip(), ", ".join(units)
 
 
 def field_names(fields: Any, color: Any = None) -> list[str]:

@@ -86,6 +86,7 @@ class _PictureWriter(Look, Output):
         )  # fmt: skip
         animation.origin, animation.parts, animation.rest = self._origin, self._surface.parts(), self._rest
         animation.label, animation.by_body = getattr(sim, "label", ""), rigid
+        animation.worlds = self._surface.worlds
         self.check_names([name for name, _, _ in animation.parts])
         if self.edges:
             animation.edges = self._surface.edges()
