@@ -69,8 +69,9 @@ def test_two_outputs_of_one_file_and_names_too_long_for_it(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     b = wf.ModelBuilder()
     law = wf.SVK(E=1e7, nu=0.3, density=1e3)
-    for name in ("x" * 300, "x" * 200):
-        b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=law, name=name)
+    names = ["x" * 300, "x" * 200, "a/b", "a_b"]
+    for k, name in enumerate(names):
+        b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1), origin=(k, 0, 0)), material=law, name=name)
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     kinds = {"a.html": wf.HTMLWriter, "a.usdc": wf.USDWriter, "a": wf.VTUWriter, "a.npz": wf.Checkpoint}
     for name, make in kinds.items():
@@ -78,7 +79,10 @@ def test_two_outputs_of_one_file_and_names_too_long_for_it(tmp_path, monkeypatch
             sim.run(1e-3, outputs=[make(name), make(tmp_path / name)])
         assert not (tmp_path / name).exists()
     sim.run(1e-3, outputs=[wf.VTUWriter("")])
-    assert wf.read_results(tmp_path).bodies == ["x" * 100, "x" * 100 + "-"]
+    assert (tmp_path / f"{'x' * 100}-_0000_000000.vtu").exists()
+    saved = wf.read_results(tmp_path)
+    assert saved.bodies == names
+    assert [round(saved.positions(name)[0, 0, :, 0].min()) for name in names] == [0, 1, 2, 3]
     for make in (wf.HTMLWriter, wf.USDWriter, wf.VTUWriter):
         for fields in (None, "J", [3]):
             with pytest.raises(wf.ModelError, match="fields must be names of fields"):

@@ -6,7 +6,7 @@ import os
 import pathlib
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -20,7 +20,7 @@ from ..model.surfaces import reference_points
 from ..terms.fields import SYMMETRIC
 from .frames import FrameClock, check_fields, field_names, frame_time
 from .obstacles import Obstacles
-from .vtk_reader import read_series, symmetric_fields
+from .vtk_reader import listed_names, read_series
 
 __all__ = ["VTUFile", "VTUWriter"]
 
@@ -94,7 +94,8 @@ class VTUWriter(Output):
         self._frames: list[tuple[float, list[str]]] = []
         self._colliders: list[tuple[float, list[str]]] = []
         self._indexed_frames = 0
-        self._names = self._file_names([body.name for body in sim.model.bodies])
+        self._bodies = [body.name for body in sim.model.bodies]
+        self._names = self._file_names(self._bodies)
         points = np.concatenate([np.asarray(sim.positions(body)).reshape(-1, 3) for body in sim.model.bodies])
         self._obstacles = Obstacles(sim, points.min(axis=0), points.max(axis=0))  # half-spaces around the bodies
         named = [f"collider_{obstacle.name}" for obstacle in self._obstacles.all]
@@ -107,7 +108,7 @@ class VTUWriter(Output):
     def _resume(self, now: float) -> None:
         """Extend the frames of the series up to the time `now`, s."""
         self._frames = self._read_series(self.series, now)
-        self._symmetric |= symmetric_fields(self.series)
+        self._symmetric |= set(listed_names(self.series, "symmetric"))
         if self.collider_series.is_file():
             self._colliders = self._read_series(self.collider_series, now)
         self._kept_frames = self._indexed_frames = len(self._frames)
@@ -176,7 +177,7 @@ class VTUWriter(Output):
         return files
 
     def _write_series(self) -> None:
-        _write_pvd(self.series, self._frames, self._symmetric)
+        _write_pvd(self.series, self._frames, symmetric=sorted(self._symmetric), bodies=self._bodies)
         if self._colliders:
             _write_pvd(self.collider_series, self._colliders)
         self._indexed_frames = len(self._frames)
@@ -287,9 +288,9 @@ def _in_vtk_order(sim: Any, field: str, values: np.ndarray) -> np.ndarray:
     return values[..., [0, 1, 2, 5, 3, 4]] if spec and spec.components == SYMMETRIC else values
 
 
-def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]], symmetric: Iterable[str] = ()) -> None:
-    """Index of a series: files of each time, s, and names of the symmetric tensors."""
-    names = f" symmetric={quoteattr(json.dumps(sorted(symmetric)))}" if symmetric else ""
+def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]], **listed: list[str]) -> None:
+    """Index of a series: files of each time, s, and lists of names: symmetric tensors, bodies."""
+    names = "".join(f" {what}={quoteattr(json.dumps(some))}" for what, some in listed.items() if some)
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', f"<Collection{names}>"]
     for time, files in frames:
         lines += [

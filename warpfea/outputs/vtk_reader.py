@@ -18,7 +18,7 @@ from ..base.names import check_known
 from ..mesh.adapter import meshio_errors
 from ..terms.fields import ELEMENT_FIELDS, SYMMETRIC
 
-__all__ = ["SavedResults", "read_results", "read_series", "symmetric_fields"]
+__all__ = ["SavedResults", "listed_names", "read_results", "read_series"]
 
 FILE = re.compile(r"(.*)_(\d{4})_\d{6}\.vtu")
 """Body, world and frame of a file."""
@@ -35,9 +35,9 @@ def read_series(path: pathlib.Path) -> list[tuple[float, list[str]]]:
     return frames
 
 
-def symmetric_fields(path: pathlib.Path) -> set[str]:
-    """Names of the symmetric tensors that a .pvd lists."""
-    return set(json.loads(next(ElementTree.parse(path).getroot().iter("Collection")).get("symmetric", "[]")))
+def listed_names(path: pathlib.Path, what: str) -> list[str]:
+    """Names that a .pvd lists: its "symmetric" tensors, its "bodies"."""
+    return list(json.loads(next(ElementTree.parse(path).getroot().iter("Collection")).get(what, "[]")))
 
 
 def read_results(path: str | os.PathLike[str]) -> SavedResults:
@@ -62,7 +62,8 @@ def read_results(path: str | os.PathLike[str]) -> SavedResults:
     if not frames or not all(FILE.fullmatch(file) for _, files in frames for file in files):
         raise ModelError(f"{target}: is no series of VTUWriter")
     of_elements = {name for name, spec in ELEMENT_FIELDS.items() if spec.components == SYMMETRIC}
-    return SavedResults(target, frames, symmetric_fields(target) | of_elements)
+    symmetric = of_elements.union(listed_names(target, "symmetric"))
+    return SavedResults(target, frames, symmetric, listed_names(target, "bodies"))
 
 
 class SavedResults:
@@ -70,15 +71,17 @@ class SavedResults:
 
     Attributes:
         time: (frames,) s, or load factors.
-        bodies: names of the bodies, as in the names of the files.
+        bodies: names of the bodies; of a series that does not list them, as in the names of its files.
         worlds: number of worlds.
     """
 
-    def __init__(self, path: pathlib.Path, frames: list[tuple[float, list[str]]], symmetric: set[str]) -> None:
+    def __init__(
+        self, path: pathlib.Path, frames: list[tuple[float, list[str]]], symmetric: set[str], bodies: list[str]
+    ) -> None:
         self._folder, self._frames, self._symmetric = path.parent, [files for _, files in frames], symmetric
         self.time = np.array([time for time, _ in frames])
         found = [FILE.fullmatch(file) for file in self._frames[0]]
-        self.bodies = list(dict.fromkeys(str(match[1]) for match in found if match))
+        self.bodies = bodies or list(dict.fromkeys(str(match[1]) for match in found if match))
         self.worlds = len(found) // len(self.bodies)
 
     def __repr__(self) -> str:

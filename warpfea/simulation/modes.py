@@ -269,8 +269,10 @@ def buckling(model: Model, state: State, *, count: int = 1, world: int = 0) -> B
     start.displacement.zero_()
     system = _linearise("buckling", model, start, count, world)
     G = system.K - loaded.K
-    before, after = (model.evaluation.tangent_matrix(at, world) for at in (start, state))
-    G = G + system.restrict(after - before - model.evaluation.stress_stiffness(state, world))  # the turn would soften
+    at_rest, at_load = (model.evaluation.tangent_matrix(at, world) for at in (start, state))
+    G = G + system.restrict(
+        at_load - at_rest - model.evaluation.stress_stiffness(state, world)
+    )  # the turn would soften
     if len(system.index) <= MAX_DENSE:
         Z = system.null_space()
         try:
