@@ -162,7 +162,7 @@ CONSTANTS: dict[str, Constant] = {
     "SAGITTA_RATIO": Constant(CONTACT, "sizes of an element", 1.0e300, "contact"),
     "MIN_DEEP_OVERLAP_RATIO": Constant(CONTACT, "depth limit", 0.0, "contact"),
     "MIN_DEPTH_RATIO": Constant(CONTACT, "thicknesses", 0.0, "contact"),
-    "TOUCHING_PART_UPDATES": Constant(CONTACT, "updates", 1000000, "contact"),
+    "TOUCHING_PART_REDUCTION": Constant(CONTACT, "parts of the step", 1.0, "contact"),
     "QUADRATIC_SLOPE_RATIO": Constant(NEWTON_PCG, "slopes", 1.0e300, "contact"),
     "HARDENING": Constant(CONTACT, "1", 0.0, "contact"),
     "HARDENING_DEPTH": Constant(CONTACT, "depths of elements", 1.0e300, "contact"),

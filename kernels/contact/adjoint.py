@@ -96,19 +96,19 @@ def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     @wp.func
     def law_work(
         con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, point: int, item: int,
-        other_depth: f64, record: PointContact, inv_h: f64, way: ForceBars,
+        other_depth: f64, record: PointContact, inv_h: f64, direction: ForceBars,
     ) -> f64:  # fmt: skip
-        """Sum of what the laws give times its bars `way`. `con`: with the point as the contact."""
+        """Sum of what the laws give times its bars `direction`. `con`: with the point as the contact."""
         t = record
         t.stiffness_ratio = k.stiffness_ratio(con, facets, world, point, item, other_depth)
         t = law.with_normal_force(con, scr, world, point, point, t, inv_h)
         limits = law.friction_parameters(con, his, world, point, point, t)
         t = law.in_friction_plane(t, t.normal, limits[2])
-        out = wp.dot(way.friction, law.friction_force(con, world, point, t, limits, inv_h))
-        out -= t.normal_values[0] * wp.dot(way.normal_force, t.normal)
+        out = wp.dot(direction.friction, law.friction_force(con, world, point, t, limits, inv_h))
+        out -= t.normal_values[0] * wp.dot(direction.normal_force, t.normal)
         if t.normal_values[0] > f64(0.0) and limits[1] > f64(0.0):
-            out += wp.dot(way.slip, law.return_mapping(con, world, point, t, limits, inv_h))
-        return out + way.speed * wp.max(scr.approach_speed[world, point], inv_h * (t.depth - t.previous_depth))
+            out += wp.dot(direction.slip, law.return_mapping(con, world, point, t, limits, inv_h))
+        return out + direction.speed * wp.max(scr.approach_speed[world, point], inv_h * (t.depth - t.previous_depth))
 
     @wp.func
     def is_slipping(
@@ -126,12 +126,12 @@ def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     @wp.func
     def law_bars(
         con: Contacts, facets: Facets, his: History, scr: ContactScratch, adj: ContactAdjoint, world: int, point: int,
-        item: int, other_depth: f64, record: PointContact, inv_h: f64, way: ForceBars,
+        item: int, other_depth: f64, record: PointContact, inv_h: f64, direction: ForceBars,
     ) -> PointBars:  # fmt: skip
         """Gradient of `law_work`; that by the constants is added to the gradient arrays of `con`."""
         adj.approach_bar[world, point] = f64(0.0)
         _con, _facets, _his, _scr, _w, _p, _i, _d, bar, _h, force = wp.grad(law_work)(
-            con, facets, his, scr, world, point, item, other_depth, record, inv_h, way
+            con, facets, his, scr, world, point, item, other_depth, record, inv_h, direction
         )
         out = PointBars()
         out.normal = bar.normal

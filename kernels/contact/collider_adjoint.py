@@ -149,17 +149,17 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
                 B = rotation * B * wp.transpose(rotation)
                 start_depth = k.depth_at_start(con, facets, his, scr, world, c, item, point)
                 for row in range(4):
-                    way = ForceBars()
+                    direction = ForceBars()
                     if row < 3:
                         unit = vec3d()
                         unit[row] = area
-                        way.normal_force = unit
-                        way.friction = unit
+                        direction.normal_force = unit
+                        direction.friction = unit
                     elif t.depth > f64(0.0):
-                        way.slip = world_axes(col, con, c, rotation) * adj.spring_bar[world, point]
-                        way.speed = adj.speed_bar[world, point]
+                        direction.slip = world_axes(col, con, c, rotation) * adj.spring_bar[world, point]
+                        direction.speed = adj.speed_bar[world, point]
                     bars = law_bars(law, facets, his, scr, adj, world, point, item, f64(0.0), t,
-                                    k.inverse_step(clock, world), way)  # fmt: skip
+                                    k.inverse_step(clock, world), direction)  # fmt: skip
                     bars = with_side_face(t, bars, start_depth)
                     end = B * bars.normal - bars.depth * t.normal + bars.motion
                     if row < 3:
@@ -221,13 +221,13 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
                 start_axes = col.previous_rotation[world, kc]
                 Q = end_axes * wp.transpose(start_axes)
                 B = end_axes * normal_derivative(col, kc, t.local_position, t.feature) * wp.transpose(end_axes)
-                way = ForceBars()
-                way.normal_force = -area * k.interpolate(facets, w, world, q, item)
-                way.friction = way.normal_force
+                direction = ForceBars()
+                direction.normal_force = -area * k.interpolate(facets, w, world, q, item)
+                direction.friction = direction.normal_force
                 if touching:
-                    way.slip = axes * adj.spring_bar[world, point]
-                    way.speed = adj.speed_bar[world, point]
-                bars = law_bars(law, facets, his, scr, adj, world, point, item, f64(0.0), t, inv_h, way)
+                    direction.slip = axes * adj.spring_bar[world, point]
+                    direction.speed = adj.speed_bar[world, point]
+                bars = law_bars(law, facets, his, scr, adj, world, point, item, f64(0.0), t, inv_h, direction)
                 bars = with_side_face(t, bars, before)
                 # at the start
                 y = scr.start_position[world, point]
@@ -251,12 +251,12 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws
                 start = wp.transpose(Q) * moved - bars.previous_depth * n + fast * (C * v)
                 axis = col.rotation_axis[kc]
                 anchor = col.rotation_anchor[kc]
-                place = t.position - t.relative_motion
+                material_point = t.position - t.relative_motion
                 out.shift = moved - at_end
                 out.turn = wp.dot(axis, wp.cross(t.normal, bars.normal) - wp.cross(t.position - anchor, at_end)
-                                  + wp.cross(place - anchor, moved))  # fmt: skip
+                                  + wp.cross(material_point - anchor, moved))  # fmt: skip
                 if con.law[c] & FIXED_SPRING == 0:
-                    out.turn += wp.dot(axis, wp.cross(t.spring, bars.spring) - wp.cross(bars.slip, way.slip))
+                    out.turn += wp.dot(axis, wp.cross(t.spring, bars.spring) - wp.cross(bars.slip, direction.slip))
                 out.start_shift = -start
                 out.start_turn = wp.dot(axis, fast * wp.cross(n, v) - wp.cross(x_n - anchor, start))
                 out.position = start - (fast * inv_h) * n

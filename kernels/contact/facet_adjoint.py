@@ -49,7 +49,7 @@ def adjoint_fields_struct(dtype: str):
     class AdjointFields:
         displacement: wp.array2d(dtype=wp.vec3d)  # at the end, m
         velocity: p.vec3_2d  # at the start, m/s
-        way: p.vec3_2d  # that the forces of points work on
+        direction: p.vec3_2d  # that the forces of points work on
         force_weight: f64  # of that work
         history_weight: f64  # of the loss by the histories after the step
         at_start: wp.int32  # 1: bars at the start of the step, 0: at its end
@@ -69,7 +69,7 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     a, c_ = contact_adjoint_functions(dtype, own), facet_adjoint_functions(dtype)
     FacetPoint, surface_point, facet_frame = f_.FacetPoint, f_.surface_point, g.search.facet_frame
     law_bars, is_slipping, count_switch = a.law_bars, a.is_slipping, a.count_switch
-    PointMotion, Places, Curvatures, FacetWay = c_.PointMotion, c_.Places, c_.Curvatures, c_.FacetWay
+    PointMotion, Places, Curvatures, FacetDirection = c_.PointMotion, c_.Places, c_.Curvatures, c_.FacetDirection
     curvature, field_point, shape_jet, geometry_work = c_.curvature, c_.field_point, c_.shape_jet, c_.geometry_work
     project_on_facet = f_.project_on_facet
     module = kernel_module("_".join(["facet_adjoint", dtype, *law_names(own)]), block_dim=64)
@@ -180,7 +180,7 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         active: int_1d, scr: ContactScratch, adj: ContactAdjoint, bars: FacetBars,
     ):  # fmt: skip
         """Bars of points and of their facet points at the end, or at the start, of a step: of the work of their forces
-        on a field `way`, and of the loss by their histories, with the weights of `fields`."""
+        on a field `direction`, and of the loss by their histories, with the weights of `fields`."""
         world, item, q = wp.tid()
         point = facets.first_point + item * facets.point_count + q
         c = facets.contact[item]
@@ -202,21 +202,21 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
             places = places_of(other, fields, world, at)
             turns = con.law[c] & FIXED_SPRING == 0
             scale = fields.force_weight * area
-            own_way = k.interpolate(facets, fields.way, world, q, item)
-            way = FacetWay()
-            way.at_projection = field_point(other.masters, fields.way, world, at.facet, at.projection)
-            way.at_own = field_point(other.masters, fields.way, world, at.facet, at.own)
+            own_direction = k.interpolate(facets, fields.direction, world, q, item)
+            direction = FacetDirection()
+            direction.at_projection = field_point(other.masters, fields.direction, world, at.facet, at.projection)
+            direction.at_own = field_point(other.masters, fields.direction, world, at.facet, at.own)
             force = ForceBars()
-            force.normal_force = scale * (own_way - way.at_projection.position)
-            force.friction = scale * (own_way - way.at_own.position)
+            force.normal_force = scale * (own_direction - direction.at_projection.position)
+            force.friction = scale * (own_direction - direction.at_own.position)
             if touching:
                 force.slip = fields.history_weight * adj.spring_bar[world, point]
                 force.speed = fields.history_weight * adj.speed_bar[world, point]
             if turns:
-                way.slip = force.slip
-                force.slip = facet_frame(places.own) * way.slip
+                direction.slip = force.slip
+                force.slip = facet_frame(places.own) * direction.slip
                 if was_touching:
-                    way.spring = his.spring[world, point]
+                    direction.spring = his.spring[world, point]
             inv_h = k.inverse_step(clock, world)
             depth = other.masters.element_depth[at.facet]
             b = law_bars(law, facets, his, scr, adj, world, point, item, depth, t, inv_h, force)
@@ -231,8 +231,8 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
                 if lowest > f64(MIN_APPROACH_SPEED):
                     speed_bar = b.approach_speed
                 b.approach_speed = f64(0.0)
-            moved, near, _second, _anchored, _bars, way_bar = wp.grad(geometry_work)(
-                motion, places, curvatures_of(other, world, at), at.anchored, b, way
+            moved, near, _second, _anchored, _bars, direction_bar = wp.grad(geometry_work)(
+                motion, places, curvatures_of(other, world, at), at.anchored, b, direction
             )
             store_places(bars, world, point, fields.at_start, at, near)
             if fields.at_start != 0:
@@ -240,7 +240,7 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
             if was_touching:
                 spring_bar = b.spring
                 if turns:
-                    spring_bar = spring_at_start(other, world, point, at, places.start_anchor, way_bar.spring)
+                    spring_bar = spring_at_start(other, world, point, at, places.start_anchor, direction_bar.spring)
         if fields.at_start == 0:
             adj.end_bar[world, point] = moved.position
             return
@@ -277,9 +277,9 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
                 s = shape_jet(other.masters, f, i, bars.coordinates[world, point, n])
                 total += s[0] * bars.position[world, point, n] + s[1] * bars.tangent_a[world, point, n]
                 total += s[2] * bars.tangent_b[world, point, n] + s[3] * bars.director[world, point, n]
-        place = other.masters.first_entry + entry
+        pool_entry = other.masters.first_entry + entry
         if add != 0:
-            total += vec3d(pool[world, place])
-        pool[world, place] = vec3(total)
+            total += vec3d(pool[world, pool_entry])
+        pool[world, pool_entry] = vec3(total)
 
     return kernel_set(locals())

@@ -46,8 +46,8 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
         for m in range(mas.monomial_count[kind]):
             i = mas.exponents[kind, m][0]
             j = mas.exponents[kind, m][1]
-            rise = mas.reference_director_coefficients[m, f] + U.director[world, mas.max_monomials * f + m]
-            g = mas.reference_position_coefficients[m, f] + U.value[world, mas.max_monomials * f + m] + xi[2] * rise
+            director = mas.reference_director_coefficients[m, f] + U.director[world, mas.max_monomials * f + m]
+            g = mas.reference_position_coefficients[m, f] + U.value[world, mas.max_monomials * f + m] + xi[2] * director
             if i > 1:
                 out.aa += (f64(i * (i - 1)) * power(xi[0], i - 2) * power(xi[1], j)) * g
             if j > 1:
@@ -55,9 +55,9 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
             if i > 0 and j > 0:
                 out.ab += (f64(i * j) * power(xi[0], i - 1) * power(xi[1], j - 1)) * g
             if i > 0:
-                out.director_a += (f64(i) * power(xi[0], i - 1) * power(xi[1], j)) * rise
+                out.director_a += (f64(i) * power(xi[0], i - 1) * power(xi[1], j)) * director
             if j > 0:
-                out.director_b += (f64(j) * power(xi[0], i) * power(xi[1], j - 1)) * rise
+                out.director_b += (f64(j) * power(xi[0], i) * power(xi[1], j - 1)) * director
         return out
 
     @wp.func
@@ -68,8 +68,8 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
         for m in range(mas.monomial_count[kind]):
             a = mas.exponents[kind, m][0]
             b = mas.exponents[kind, m][1]
-            rise = f64(mas.director_shape[m, i, f])
-            s = f64(mas.shape[m, i, f]) + xi[2] * rise
+            director_shape_value = f64(mas.director_shape[m, i, f])
+            s = f64(mas.shape[m, i, f]) + xi[2] * director_shape_value
             pa = power(xi[0], a)
             pb = power(xi[1], b)
             da = f64(0.0)
@@ -78,7 +78,7 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
                 da = f64(a) * power(xi[0], a - 1)
             if b > 0:
                 db = f64(b) * power(xi[1], b - 1)
-            out += wp.vec4d(pa * pb * s, da * pb * s, pa * db * s, pa * pb * rise)
+            out += wp.vec4d(pa * pb * s, da * pb * s, pa * db * s, pa * pb * director_shape_value)
         return out
 
     @wp.func
@@ -154,7 +154,7 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
         start_projection: Curvature
 
     @wp.struct
-    class FacetWay:
+    class FacetDirection:
         """The field that forces work on, at the projection and at the point's own coordinates; elastic slip, and the
         bar of that after the step, in the axes of the facets."""
 
@@ -165,10 +165,10 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
 
     @wp.func
     def geometry_work(
-        point: PointMotion, at: Places, second: Curvatures, anchored: int, bars: PointBars, way: FacetWay
+        point: PointMotion, at: Places, second: Curvatures, anchored: int, bars: PointBars, direction: FacetDirection
     ) -> f64:  # fmt: skip
-        """Sum of the bars of a record times its changes, and of the changes of the work of both forces on a field `way`
-        with their places."""
+        """Sum of the bars of a record times its changes, and of the changes of the work of both forces on a field
+        `direction` with their places."""
         x = point.position
         x_n = point.start_position
         r = x - at.projection.position
@@ -176,11 +176,12 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
         n = normal_after(at.projection, second.projection, d)
         gap = wp.dot(n, r)
         out = wp.dot(bars.normal, n) - bars.depth * gap
-        out -= wp.dot(bars.normal_force, d[0] * way.at_projection.tangent_a + d[1] * way.at_projection.tangent_b)
+        out -= wp.dot(bars.normal_force, d[0] * direction.at_projection.tangent_a
+                      + d[1] * direction.at_projection.tangent_b)  # fmt: skip
         e = local_components(at.own, x - at.own.position)
-        out -= wp.dot(bars.friction, e[0] * way.at_own.tangent_a + e[1] * way.at_own.tangent_b
-                      + e[2] * way.at_own.director)  # fmt: skip
-        out += wp.dot(bars.slip, turned(at.own, second.own, e, way.slip))
+        out -= wp.dot(bars.friction, e[0] * direction.at_own.tangent_a + e[1] * direction.at_own.tangent_b
+                      + e[2] * direction.at_own.director)  # fmt: skip
+        out += wp.dot(bars.slip, turned(at.own, second.own, e, direction.slip))
         s = e
         if anchored != 0:
             s = local_components(at.start_anchor, x_n - at.start_anchor.position)
@@ -188,7 +189,7 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
         out += wp.dot(bars.motion, motion)
         if anchored == 0:
             return out + bars.previous_depth * (wp.dot(n, motion) - gap)
-        out += wp.dot(bars.spring, turned(at.anchor, second.anchor, s, way.spring))
+        out += wp.dot(bars.spring, turned(at.anchor, second.anchor, s, direction.spring))
         r_n = x_n - at.start_projection.position
         d_n = projection_step(at.start_projection, second.start_projection, r_n)
         n_n = normal_after(at.start_projection, second.start_projection, d_n)

@@ -112,22 +112,22 @@ def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> Kern
         momentum = T(c.mass_factor) * mass_times(topo, w, world, slot)
         V = velocity_bar(step, c, v_bar, q_before, v_before, world, slot)
         r = -gradient[world, slot]
-        held = r - wp.cw_mul(topo.free[slot], r)
+        reaction = r - wp.cw_mul(topo.free[slot], r)
         drive = wp.cw_mul(driven[slot], r)
         v_tilde = momentum
-        q_start = scale * (held - drive)
+        q_start = scale * (reaction - drive)
         v_start = vec3()
         if wp.static(multistep):
-            remembered = v_before[world, slot]
+            previous_velocity_bar = v_before[world, slot]
             q_start += q_before[world, slot]
             q_before[world, slot] = vec3()
             v_before[world, slot] = -T(c.a1) * v_tilde
             if stops(step, world):
                 previous = step.acceleration_step[world]
                 ratio = wp.where(previous > f64(0.0), step.h[world] / wp.max(previous, f64(1.0e-300)), f64(0.0))
-                remembered = T(-ratio) * remembered
-                v_before[world, slot] = v_before[world, slot] - remembered
-            v_start += remembered
+                previous_velocity_bar = T(-ratio) * previous_velocity_bar
+                v_before[world, slot] = v_before[world, slot] - previous_velocity_bar
+            v_start += previous_velocity_bar
         if wp.static(accelerated):
             a_bar = q_before[world, slot]
             v_tilde -= T(c.mass_factor) * v_before[world, slot]
@@ -136,7 +136,7 @@ def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> Kern
             v_before[world, slot] = T(c.v_w) * v_tilde
         q_bar[world, slot] = q_start
         v_bar[world, slot] = v_start + T(c.a0) * v_tilde
-        x = scale * (momentum - V + r - held)
+        x = scale * (momentum - V + r - reaction)
         add_predictor_bar(c, x, q_bar, v_bar, q_before, v_before, world, slot)
         drive_bar[world, slot] = scale * drive
 
@@ -183,8 +183,8 @@ def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> Kern
         """w = (change of the position)/d of prescribed components, 0 of others."""
         world, slot = wp.tid()
         scale = T(1.0) / T(step_coefficients(step, world).dq_dv)
-        held = q[world, slot] - wp.cw_mul(free[slot] + driven[slot], q[world, slot])
-        w[world, slot] = scale * (held + wp.cw_mul(driven[slot], drive[world, slot]))
+        prescribed = q[world, slot] - wp.cw_mul(free[slot] + driven[slot], q[world, slot])
+        w[world, slot] = scale * (prescribed + wp.cw_mul(driven[slot], drive[world, slot]))
 
     @masked_kernel(module, "active")
     def change_side(step: Step, topo: Topology, x: p.vec3_2d, force: p.vec3_2d, active: int_1d, out: p.vec3_2d):

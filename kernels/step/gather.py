@@ -154,15 +154,15 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         a = T(balance.mass_factor[world]) * a
         load = balance.dead[world, slot]
         magnitude = balance.dead_magnitude[world, slot]
-        held = load
+        frozen_load = load
         if wp.static(traits.nonpotential):
             new = balance.nonpotential[world, slot]
-            held = load + balance.nonpotential_frozen[world, slot]
+            frozen_load = load + balance.nonpotential_frozen[world, slot]
             load = load + new
             for k in range(3):
                 magnitude[k] = magnitude[k] + wp.abs(new[k])
         residual_force = a + f - load
-        descent = a + f - held
+        descent = a + f - frozen_load
         if wp.static(traits.constraint_rows):
             constraint_force = constraint_forces(con, mul, world, slot)
             residual_force += vec3(constraint_force[0])
@@ -179,7 +179,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         D = balance.diagonal[world, slot]
         vs = balance.v[world, slot]
         kinetic = T(0.5) * wp.dot(vs - balance.v_tilde[world, slot], a)
-        work = wp.dot(held, vs)
+        work = wp.dot(frozen_load, vs)
         balance.rows[Row.RESIDUAL, world, slot] = weighted_square(wp.cw_mul(residual_force, free), D)
         # a prestressed body without loads has only reactions: a small fraction of them is its scale
         reaction = own - wp.cw_mul(own, free)
@@ -237,9 +237,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
                 constraint_force += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
             out += vec3(constraint_force)
-        held = int(topo.prescribed_bits[slot])
+        bits = int(topo.prescribed_bits[slot])
         for k in range(3):
-            if held & (1 << k) != 0:
+            if bits & (1 << k) != 0:
                 out[k] = T(0.0)
         result[world, slot] = out
         return f64(wp.dot(out, p))

@@ -20,7 +20,7 @@ from ..terms.protocols import Differentiable
 from ..terms.term import StepContext, part
 from .tables import MATERIAL_CONSTANTS, POINT_SUM_LANES, bodies_of, contact_constants, restitution_slopes
 
-__all__ = ["ContactAdjoint", "DifferentiableColliders", "DifferentiableContact", "together"]
+__all__ = ["ContactAdjoint", "DifferentiableColliders", "DifferentiableContact", "sum_of_gradients"]
 
 RELATIVE_STEP = 1e-3
 """Four-point differences of the law's constants by those of materials, of which they are roots and quotients."""
@@ -128,7 +128,7 @@ def with_gradient(of: wp.array) -> wp.array:
     return wp.array(ptr=of.ptr, dtype=of.dtype, shape=of.shape, device=of.device, requires_grad=True)
 
 
-def together(parts: list[Gradient]) -> Gradient:
+def sum_of_gradients(parts: list[Gradient]) -> Gradient:
     """Sum of several."""
 
     def add(at: StepAdjoint, out: wp.array) -> None:
@@ -214,7 +214,7 @@ class DifferentiableContact(Differentiable):
 
     def _law_gradients(self, ctx: StepContext, of: list[int], name: str) -> Gradient:
         """Derivative by a parameter of some contacts."""
-        return together([self._law_gradient(ctx, k, name) for k in of])
+        return sum_of_gradients([self._law_gradient(ctx, k, name) for k in of])
 
     def _law_gradient(self, ctx: StepContext, k: int, name: str) -> Gradient:
         """Derivative by a parameter of a contact."""
@@ -227,7 +227,7 @@ class DifferentiableContact(Differentiable):
             if np.isnan(slopes).any():
                 raise ModelError("Adjoint: a restitution of 0 has no derivative")
             factors[name] = dict(zip(("damping", "beta"), slopes))
-        return together([a.sum_of(self._factors({k: f}), a.want(key)) for key, f in factors[name].items()])
+        return sum_of_gradients([a.sum_of(self._factors({k: f}), a.want(key)) for key, f in factors[name].items()])
 
     def _material_gradient(self, ctx: StepContext, of: list[int], members: list[Any], name: str) -> Gradient:
         """Derivative by a constant of some materials, through the constants of the laws that follow from it."""
@@ -240,7 +240,7 @@ class DifferentiableContact(Differentiable):
                 rows = world if varies else slice(None)
                 for key, value in self._slopes(tables.contacts[k], members, name, world).items():
                     found[key][rows, k] = value
-        return together([a.sum_of(f, a.want(key)) for key, f in found.items() if f.any()])
+        return sum_of_gradients([a.sum_of(f, a.want(key)) for key, f in found.items() if f.any()])
 
     def _slopes(self, contact: Any, members: list[Any], name: str, world: int) -> dict[str, Any]:
         """Derivatives of the constants of a contact in a world by a constant of some materials."""

@@ -23,7 +23,7 @@ from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from ..terms.gradients import Gradient
 from ..terms.term import StepContext, part
-from .adjoint import DifferentiableColliders, together
+from .adjoint import DifferentiableColliders, sum_of_gradients
 from .collider_tables import ContactTables, poses_by_laws
 from .evaluation import (
     contact_field,
@@ -311,7 +311,7 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
                 factor = mine[None, :, None] * np.ones(3) if values == "shift_bar" else mine[None]
                 a = self.adjoint(ctx)
                 found.append(a.sum_of(factor, getattr(a.data, values), along=False))
-        return together(found) if found else None
+        return sum_of_gradients(found) if found else None
 
     # at a state
 

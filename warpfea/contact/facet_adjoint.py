@@ -67,13 +67,13 @@ class DifferentiableFacets(DifferentiableContact):
         return modules
 
     def _adjoint_of_points(
-        self, ctx: StepContext, way: wp.array, active: wp.array, weights: tuple[float, float], *, constants: Any,
+        self, ctx: StepContext, direction: wp.array, active: wp.array, weights: tuple[float, float], *, constants: Any,
         at_start: bool = False,
     ) -> None:  # fmt: skip
         """Bars of the points and of their places on facets."""
         a, s = self.adjoint(ctx), ctx.scratch[self.name]
         fields = adjoint_fields_struct(self.model.dtype)()
-        fields.displacement, fields.velocity, fields.way = s["u"], ctx.state.velocity, way
+        fields.displacement, fields.velocity, fields.direction = s["u"], ctx.state.velocity, direction
         fields.force_weight, fields.history_weight = weights
         fields.at_start = int(at_start)
         for group in self.tables.groups:

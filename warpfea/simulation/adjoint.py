@@ -29,7 +29,7 @@ from ..terms.protocols import Differentiable
 from ..terms.shape_gradients import MESH, MeshGradient
 from .initial_adjoint import check_initial_conditions, check_names, step_back_to_initial
 from .loss import Loss
-from .sensitivities import Forward
+from .sensitivities import ForwardSensitivities
 from .simulation import Simulation
 from .statics import StaticResult
 from .stepper import Stepper
@@ -98,10 +98,11 @@ class Adjoint(Tape):
             self.outputs = {name: self._sources(name) for name in self.names}
         check_names(self.stepper.initial_conditions, self.names)
         self.residual = self.growth = np.zeros(m.worlds)
-        self._forward: Forward | None = None
+        self._forward: ForwardSensitivities | None = None
         self._sums = {name: self.zeros(self.size_of(name)) for name in self.names}
         self._sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
         if self.static:
+            # an equilibrium is the step from it to itself
             self.kept += 2 * [self._snapshot() | {"status": wp.clone(self.sim.state.status)}]
             self.ends = [1]
 
@@ -243,7 +244,7 @@ class Adjoint(Tape):
             ConvergenceError: a residual above 1e-6, in all worlds that run.
         """
         if self._forward is None or self._forward.updates != self.updates:
-            self._forward = Forward(self)
+            self._forward = ForwardSensitivities(self)
         found = self._forward.run(direction)
         self._check_result()
         return found

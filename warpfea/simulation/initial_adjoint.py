@@ -17,7 +17,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.worlds import set_rows
-from ..terms.gradients import COMPLEX_STEP
+from ..terms.gradients import COMPLEX_STEP, ForceGradient
 from ..terms.protocols import Constrained, Differentiable
 from ..terms.shape_gradients import MESH
 from .consistent_initial_conditions import rates_of_vectors, right_sides, term_vectors
@@ -262,7 +262,7 @@ def _add_inertia(s: Stepper, at: StepAdjoint, flags: np.ndarray, h: float, gradi
         set_rows(w.v_tilde, flags, 0.0 * x[flags])
         set_rows(at.solver.w, flags, y[flags])
         for add, out in gradients:
-            if getattr(add, "inertia", False):
+            if isinstance(add, ForceGradient) and add.inertia:
                 add(at, out)
 
 

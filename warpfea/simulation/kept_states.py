@@ -57,7 +57,7 @@ class KeptStates(list[dict[str, wp.array]]):
         self.starts: list[int] = []  # index of the start of each step
         self.dt: list[Any] = []  # of each step
         self.checkpoints: dict[int, State] = {}  # by step
-        self.at_hand: list[int] = []  # single parts of a step whose state is on the device
+        self.resident: list[int] = []  # single parts of a step whose state is on the device
         self.stride, self.expected, self.recomputed = 1, 0, 0
 
     def expect(self, steps: int) -> None:
@@ -90,7 +90,7 @@ class KeptStates(list[dict[str, wp.array]]):
         self.starts.append(len(self) - 1)
         if self.budget is None:
             return
-        dt = self.sim.stepper._dt
+        dt = self.sim.stepper.dt_of_step
         self.dt.append(dt if isinstance(dt, float) else wp.clone(self.sim.stepper.work.step.dt))
         beyond = k == 0 or (self.expected + 1) * self.size > self.budget
         if self.files is None and beyond and k % self.stride == 0:
@@ -104,9 +104,9 @@ class KeptStates(list[dict[str, wp.array]]):
         if self.budget is None:
             return
         if self.files or self.starts[-1] == len(self) - 2:
-            self.at_hand += range(self.starts[-1], len(self) - 1)
-        while len(self.at_hand) > self._room - 1:
-            self._put_away(self.at_hand.pop(0))
+            self.resident += range(self.starts[-1], len(self) - 1)
+        while len(self.resident) > self._room - 1:
+            self._evict(self.resident.pop(0))
 
     @property
     def _room(self) -> int:
@@ -115,7 +115,7 @@ class KeptStates(list[dict[str, wp.array]]):
         taken = len(self.checkpoints) * self.whole if len(self.checkpoints) > 1 else 0
         return max((self.budget - taken) // self.size, 2)
 
-    def _put_away(self, i: int) -> None:
+    def _evict(self, i: int) -> None:
         item = super().__getitem__(i)
         state = {name: item.pop(name) for name in self.names}
         if self.files and not self._file(i).is_file():
@@ -127,40 +127,40 @@ class KeptStates(list[dict[str, wp.array]]):
     def __getitem__(self, i: Any) -> Any:
         item = super().__getitem__(i)
         if isinstance(i, int) and self.names[0] not in item:
-            for j in [j for j in self.at_hand if j != i + 1]:  # the way back reads a state after its follower
-                self.at_hand.remove(j)
-                self._put_away(j)
+            for j in [j for j in self.resident if j != i + 1]:  # the way back reads a state after its follower
+                self.resident.remove(j)
+                self._evict(j)
             if self.files:
-                self._read(i)
+                self._load_file(i)
             else:
-                self._compute(i)
+                self._recompute(i)
         return item
 
-    def _bring_back(self, i: int, state: dict[str, wp.array]) -> None:
+    def _restore_arrays(self, i: int, state: dict[str, wp.array]) -> None:
         super().__getitem__(i).update(state)
-        self.at_hand.append(i)
+        self.resident.append(i)
 
-    def _read(self, i: int) -> None:
+    def _load_file(self, i: int) -> None:
         specs, device = self.sim.state.specs, self.sim.model.device
         with np.load(self._file(i)) as data:
             state: dict[str, wp.array] = {
                 name: wp.array(data[name], dtype=specs[name].dtype, device=device) for name in self.names
             }
-        self._bring_back(i, state)
+        self._restore_arrays(i, state)
 
-    def _compute(self, i: int) -> None:
+    def _recompute(self, i: int) -> None:
         """Compute the states up to i again, from the whole one before them."""
         sim, stepper, last = self.sim, self.sim.stepper, self.starts.index(i)
         first = max(k for k in self.checkpoints if k <= last)
         sim.statistics.sync_from_device()
-        now, report, dt = sim.state.copy(), wp.clone(stepper.work.report), stepper._dt
+        now, report, dt = sim.state.copy(), wp.clone(stepper.work.report), stepper.dt_of_step
         self._restore(self.checkpoints[first])
         for k in range(first, last + 1):
             item = super().__getitem__(self.starts[k])
             if stepper.initial_conditions is not None:
                 stepper.initial_conditions.prepare(self.dt[k])
             if k > last - max(self._room - 2, 1) and self.names[0] not in item:
-                self._bring_back(self.starts[k], {name: wp.clone(getattr(sim.state, name)) for name in self.names})
+                self._restore_arrays(self.starts[k], {name: wp.clone(getattr(sim.state, name)) for name in self.names})
             if k < last:
                 for name in self.controls:
                     wp.copy(getattr(sim.state, name), item[name])

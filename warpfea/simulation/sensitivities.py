@@ -11,13 +11,14 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.names import listing
 from ..terms.checks import overrides
+from ..terms.gradients import Sensitivity
 from ..terms.protocols import Differentiable
 from .tape import ProbeArrays
 
-__all__ = ["Forward"]
+__all__ = ["ForwardSensitivities"]
 
 
-class Forward:
+class ForwardSensitivities:
     """Tangent-linear run over the steps of a tape.
 
     Raises:
@@ -33,12 +34,12 @@ class Forward:
             backward = (Differentiable.add_history_gradient, Differentiable.linearise_adjoint)
             if any(overrides(term, method) for method in backward) and not overrides(term, own):
                 raise ModelError(f"Adjoint.forward: {term.name!r} has no sensitivities of its histories")
-        self.solver.prepare_forward()
+        tape.at.prepare_forward()
         self.gradients: dict[str, list[Any]] = {
             name: [make() for make in makers] for name, makers in tape.outputs.items()
         }
         for name, found in self.gradients.items():
-            if not all(hasattr(gradient, "change") for gradient in found):
+            if not all(isinstance(gradient, Sensitivity) for gradient in found):
                 raise ModelError(f"Adjoint.forward: {name!r} has no sensitivity; take backward()")
         self.changes = {name: tape.zeros(tape.size_of(name)) for name, found in self.gradients.items() if found}
         self.updates = tape.updates

@@ -292,13 +292,13 @@ class Stepper:
 
     def set_dt(self, dt: Any) -> None:
         """Set the step of all worlds, s, or of each [world]."""
-        self._dt = dt
+        self.dt_of_step = dt
         write_times(self.work.step.dt, dt)
 
     def run(self) -> None:
         """Take one step in every running world."""
         if self.initial_conditions is not None:
-            self.initial_conditions.prepare(self._dt)
+            self.initial_conditions.prepare(self.dt_of_step)
         with convert_memory_errors("a step", self.model.device):
             if self.graph is not None:
                 wp.capture_launch(self.graph)

@@ -117,7 +117,7 @@ class Tape:
                 running &= self.kept[-1]["time"].numpy() != self.sim.time  # others were at their end
                 divided = running & ((report.halvings > 0) | bool(stepper.step_size_control))
                 if divided.any():
-                    self._take_again(divided, running, controls)
+                    self._record_substeps(divided, running, controls)
                 else:
                     self._add_part(running, controls)
                 self.ends.append(len(self.kept) - 1)
@@ -145,7 +145,7 @@ class Tape:
         self.kept[-1]["status"] = wp.array(status, dtype=wp.int32, device=self.model.device)
         self.kept.append(self._snapshot())
 
-    def _take_again(self, divided: np.ndarray, running: np.ndarray, controls: dict[str, wp.array]) -> None:
+    def _record_substeps(self, divided: np.ndarray, running: np.ndarray, controls: dict[str, wp.array]) -> None:
         """Take a step again in worlds that divided it, part by part."""
         s, state, flags = self.sim.stepper, self.sim.state, device_flags(divided, self.model.device)
         assert s.backup is not None

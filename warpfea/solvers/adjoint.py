@@ -79,7 +79,8 @@ class ExactOperator:
 
 
 class AdjointSolver:
-    """Adjoint of the step that a Newton loop is linearised at.
+    """Adjoint of the step that a Newton loop is linearised at. The loop then serves it alone: its linear solver is
+    replaced.
 
     Attributes:
         bars: derivatives of the loss by arrays of the state, by their names; `solve` replaces those at the end of a

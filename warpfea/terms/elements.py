@@ -178,7 +178,7 @@ class Elements(Differentiable):
                 at.add_to(name, at.scratch)
         if found := self.history_kernels("rate"):
             self._history_force(at, found, at.ctx.work.u, at.ones, at.w, transposed=1)
-            at.add_predictor_bar(at.scratch, at.active)
+            at.add_predictor_bar(at.scratch)
 
     def add_history_change(self, at: StepAdjoint) -> None:
         ctx = at.ctx

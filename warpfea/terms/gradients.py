@@ -7,10 +7,10 @@ constants that users give are those of a complex step through the code of the ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -36,6 +36,7 @@ __all__ = [
     "FOUR_POINTS",
     "ForceGradient",
     "Gradient",
+    "Sensitivity",
     "StepAdjoint",
     "WeightGradient",
     "compile_kernels",
@@ -56,8 +57,8 @@ class StepAdjoint:
 
     Attributes:
         ctx: at its end; its state is that of the start.
-        solver: of solvers/adjoint.py, with w, mu, drive_bar, bars, kernels, `history_fields`, `add_predictor_bar`; of
-            changes along a direction, in place of bars, with force, drive, q_tilde.
+        solver: `AdjointSolver` of solvers/adjoint.py, which describes w, mu, bars, q_bar, v_bar, drive_bar, kernels.
+        force, drive, q_tilde: of changes along a direction, in place of bars; known after `prepare_forward`.
         scratch: [world, slot].
         switches: [world] counts of points that came into contact or left it, began to slip or stuck.
     """
@@ -67,9 +68,25 @@ class StepAdjoint:
     scratch: wp.array
     switches: wp.array
 
-    def __getattr__(self, name: str) -> Any:
-        """Attributes of the solver."""
-        return getattr(self.solver, name)
+    def __post_init__(self) -> None:
+        s = self.solver
+        self.w, self.mu, self.q_bar, self.v_bar, self.drive_bar = s.w, s.mu, s.q_bar, s.v_bar, s.drive_bar
+        self.bars: dict[str, wp.array] = s.bars
+        self.kernels, self.integrator, self.ones = s.kernels, s.integrator, s.ones
+
+    def prepare_forward(self) -> None:
+        """Prepare for changes along a direction."""
+        s = self.solver
+        s.prepare_forward()
+        self.force, self.drive, self.q_tilde = s.force, s.drive, s.q_tilde
+
+    def history_fields(self) -> Iterator[tuple[str, wp.array, wp.array]]:
+        """As of the solver."""
+        return self.solver.history_fields()  # type: ignore[no-any-return]
+
+    def add_predictor_bar(self, x: wp.array) -> None:
+        """Add bars x of q~ to those of the state at the start."""
+        self.solver.add_predictor_bar(x, self.active)
 
     @property
     def active(self) -> wp.array:
@@ -106,8 +123,19 @@ class StepAdjoint:
         self.ctx.launch(kernel, self.dim, [m.topology, w.contribution, self.active, out])
 
 
-Gradient = Callable[[StepAdjoint, wp.array], None]
-"""Adds the derivatives of a step to an array [world, k], float64."""
+class Gradient(Protocol):
+    """Derivative by a parameter."""
+
+    def __call__(self, at: StepAdjoint, out: wp.array, /) -> None:
+        """Add the derivatives of a step to an array [world, k], float64."""
+
+
+@runtime_checkable
+class Sensitivity(Gradient, Protocol):
+    """Derivative that goes forwards, too."""
+
+    def change(self, at: StepAdjoint, change: wp.array) -> None:
+        """Add the effect of a change [world, k] of the parameter to at.force or at.drive."""
 
 
 def compile_kernels(model: Model, kernels: Iterable[wp.Kernel]) -> None:

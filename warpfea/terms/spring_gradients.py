@@ -163,7 +163,7 @@ class DifferentiableSprings(Differentiable):
             at.add_to(name, at.scratch)
             if n == 0:  # bars of q~ by rates of vectors
                 self._sum_entries(at, 1)
-                at.add_predictor_bar(at.scratch, at.active)
+                at.add_predictor_bar(at.scratch)
         if self.has_friction:
             args = [self.data, w.u, ctx.state.displacement, w.time_law_stage_values, getattr(ctx.state, ANCHOR)]
             args += [w.step.dq_dv, at.w, at.active, scratch, at.bars[ANCHOR], scratch.product]
