@@ -59,6 +59,27 @@ def test_misuse_is_refused():
     sim.state.velocity.fill_(0.1)
     with pytest.raises(wf.ModelError, match="the state was set"):
         tape.run(1)
+    other = wf.Adjoint(wf.Simulation(m, dt=1e-3), "gravity")
+    other.run(3)
+    with pytest.raises(wf.ModelError, match="not of this tape's probes"):
+        tape.backward(wf.loss.sum_of_squares(other.probe("tip"), np.zeros((3, 3))))
+    for loss in (3.0, np.zeros(1), wp.zeros(1)):
+        with pytest.raises(wf.ModelError, match=r"a loss is one of wf\.loss"):
+            tape.backward(loss)
+    tape.probe("tip").velocity.grad.fill_(np.nan)
+    with pytest.raises(wf.ConvergenceError, match="not finite"):
+        tape.backward()
+    for change, match in (
+        ({"sim": m}, "got Model"), ({"with_respect_to": []}, "no parameter"), ({"tol": 0}, "tol = 0 must"),
+        ({"budget": -1}, "budget = -1 must"), ({"with_respect_to": "mesh.x"}, "did you mean 'mesh.X'"),
+    ):  # fmt: skip
+        with pytest.raises(wf.ModelError, match=match):
+            wf.Adjoint(**({"sim": sim, "with_respect_to": "gravity"} | change))
+    for steps in (0, -1, 2.5):
+        with pytest.raises(wf.ModelError, match="whole number"):
+            tape.run(steps)
+    with pytest.raises(wf.ModelError, match="got str"):
+        wf.loss.sum_of_squares("tip", np.zeros((3, 3)))
     with pytest.raises(wf.ModelError, match="shape"):
         wf.loss.sum_of_squares(tape.probe("tip"), np.zeros((2, 3)))
     with pytest.raises(wf.ModelError, match="there are: 'tip'"):
@@ -103,17 +124,39 @@ def test_halved_steps_are_differentiated_part_by_part():
         assert all(np.array_equal(alone[name][0], g[name][world]) for name in g)
 
 
+def test_worlds_end_at_their_own_times():
+    """The last step of all but one world is a half; their probes stay, and so do their derivatives."""
+    rows = np.concatenate([shifts(1), [[0.0]]])
+    m = linked("motor", len(rows))
+    m.set_gravity(GRAVITY * (1.0 + rows))
+    ends = np.where(np.arange(len(rows)) < len(rows) - 1, 5e-3, 1.0)
+    sim = wf.Simulation(m, dt=2e-3, t_end=ends, solver=SOLVER, constraint_tol=1e-12)
+    tape = wf.Adjoint(sim, ["gravity"])
+    tape.run(4)
+    assert sim.time[-2:] == pytest.approx([5e-3, 8e-3], rel=1e-12)
+    loss = wf.loss.sum_of_squares(tape.probe("tip").displacement, np.full((1, 4, 3), TARGET))
+    exact = [tape.backward(loss)["gravity"].numpy()[0] @ GRAVITY]
+    errors = best_differences(loss.numpy()[:-1], exact)
+    assert (errors < TOLERANCE).all(), errors
+
+
 def test_failed_worlds():
-    m = linked("motor", 2)
-    sim = wf.Simulation(m, dt=2e-3, on_failure="freeze")
-    tape = wf.Adjoint(sim, ["a.E", "motor"])
-    tape.run(2)
-    sim.freeze([1])
-    loss = wf.loss.sum_of_squares(tape.probe("tip"), np.full((2, 3), TARGET))
-    g = tape.backward(loss)
-    assert np.isfinite(g["a.E"].numpy()[0])
-    assert np.isnan(g["a.E"].numpy()[1])
-    assert np.isnan(g["motor"].numpy()[1]).all()
+    """A world that fails in a step, and one that is frozen, have NaN; the other has the bits of a run alone."""
+    found = []
+    for gravity in ([-9.81, -9.81, -1e7], [-9.81]):
+        m = linked("motor", len(gravity))
+        m.set_gravity(np.outer(gravity, [0, 0, 1.0]))
+        sim = wf.Simulation(m, dt=2e-3, on_failure="freeze")
+        tape = wf.Adjoint(sim, ["a.E", "motor"])
+        tape.run(2)
+        sim.freeze([1] if len(gravity) > 1 else [])
+        loss = wf.loss.sum_of_squares(tape.probe("tip"), np.full((2, 3), TARGET))
+        found.append({name: array.numpy() for name, array in tape.backward(loss).items()})
+        assert (sim.time > 0.0).tolist() == [True, True, False][: len(gravity)]
+    for name, values in found[0].items():
+        assert np.array_equal(values[0], found[1][name][0])
+        assert np.isfinite(values[0]).all()
+        assert np.isnan(values[1:]).all()
 
 
 def test_a_run_without_gradients_has_nothing_of_them():
@@ -130,8 +173,34 @@ def test_a_run_without_gradients_has_nothing_of_them():
     assert before == [array.numpy().tobytes() for array in (other.state.displacement, other.state.velocity)]
     assert "adjoint w" in tape.stepper.work.bytes
     assert isinstance(tape.probe("tip").velocity.grad, wp.array)
+    graph = tape._graph  # one for all steps
     again = [tape.backward()["body.E"].numpy() for _ in range(2)]
     assert np.array_equal(*again)
+    assert tape._graph is graph
+    tape.growth = np.array([1e8])
+    with pytest.warns(wf.ModelWarning, match=r"the gradient grows by 1e\+08 over 2 steps"):
+        tape._check_result()
+
+
+@wp.kernel(module="unique")
+def add_cubes(values: wp.array3d(dtype=wp.float64), loss: wp.array(dtype=wp.float64)):
+    world, step, i = wp.tid()
+    wp.atomic_add(loss, world, values[world, step, i] ** wp.float64(3.0))
+
+
+def test_a_loss_by_a_kernel():
+    """Its derivatives come by Warp's tape; of the velocities here."""
+    tape = wf.Adjoint(wf.Simulation(linked("motor", 3), dt=2e-3), ["gravity", "motor"])
+    tape.run(2)
+    v, loss = tape.probe("tip").velocity, wp.zeros(3, dtype=wp.float64, device="cpu", requires_grad=True)
+    with wp.Tape() as recorded:
+        wp.launch(add_cubes, v.shape, [v, loss], device="cpu")
+    recorded.backward(grads={loss: wp.ones(3, dtype=wp.float64, device="cpu")})
+    found = [array.numpy() for array in tape.backward().values()]
+    v.grad.assign(3.0 * v.numpy() ** 2)
+    for values, array in zip(found, tape.backward().values()):
+        assert np.abs(values).max() > 0.0
+        assert values == pytest.approx(array.numpy(), rel=1e-12)
 
 
 def test_loads_and_drives_by_name():

@@ -190,6 +190,9 @@ def test_forward_sensitivities_are_the_transpose(kind, scheme):
         assert (np.abs(right) > 1e-3 * size).all()
     with pytest.raises(wf.ModelError, match=r"'box.E' is none of the tape's"):
         tape.forward({"box.E": 1.0})
+    for change, match in (({"gravity": [1.0, 2.0]}, r"shape \(2,\), not \(2, 3\)"), ({"a.E": np.nan}, "finite")):
+        with pytest.raises(wf.ModelError, match=match):
+            tape.forward(change)
 
 
 @pytest.mark.cuda

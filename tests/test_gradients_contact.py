@@ -318,18 +318,24 @@ def test_sag_of_a_block_on_the_floor():
 
 
 def test_features_of_contact_without_an_adjoint_are_refused_by_name():
-    def refused(match, inertia=True, accelerated=False, obstacle=FAR, path=None, **options):
+    def refused(match, inertia=True, midpoint=False, accelerated=False, obstacle=FAR, path=None, **options):
         b = wf.ModelBuilder()
         box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), material=LAW)
         b.add_contact(box, b.add_collider(obstacle, path=path), restitution=0.5, **options)
-        ctx = SimpleNamespace(inertia=inertia, midpoint=False, accelerated=accelerated)
+        ctx = SimpleNamespace(inertia=inertia, midpoint=midpoint, accelerated=accelerated)
         with pytest.raises(wf.ModelError, match=match):
             check_terms(b.finalize(device="cpu"), ctx)
 
     refused("'contact' has no adjoint for contacts of model='sphere'", model="sphere", radius=0.1)
     refused("schemes with accelerations", accelerated=True)
+    refused("mid-point schemes", midpoint=True)
     refused("friction in statics", inertia=False, mu=0.3)
     refused("treatment='explicit'", law="paper", treatment="explicit")
+    b = wf.ModelBuilder()
+    part = b.add_rigid(wf.Cylinder((0, -0.2, 0.1), (0, 0.2, 0.1), 0.1), density=1000.0)
+    b.add_contact(part, b.add_collider(FAR), restitution=0.5)
+    with pytest.raises(wf.ModelError, match="'contact' has no adjoint for rigid capsules and cylinders that roll"):
+        check_terms(b.finalize(device="cpu"), SimpleNamespace(inertia=True, midpoint=False, accelerated=False))
     needle = wf.Box((0.03, 0.04, -1.0), (1e-3, 1e-3, 0.1))
     refused("'pairs' has no adjoint for obstacles .* that move", obstacle=needle, path=wf.Control("needle", 3))
     b = wf.ModelBuilder()

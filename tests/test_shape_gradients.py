@@ -135,6 +135,26 @@ def test_thickness_of_a_cantilever():
     assert rate == pytest.approx(-3.0, abs=3e-3)
 
 
+def test_length_width_and_thickness_of_a_beam_bent_by_a_couple():
+    """Two forces F at the faces of its end bend it by w = 6 F L^2 / (E b h^2), without shear."""
+    b, height, F = wf.ModelBuilder(gravity=(0, 0, 0)), 0.004, 1e-7
+    beam = b.add_beam([(0, 0, 0), (0.2, 0, 0)], elements=3, section=wf.Rectangle(0.01, height), normal=(0, 0, 1),
+                      material=wf.SVK(E=1e6, nu=0.0, density=1000.0), name="body")  # fmt: skip
+    b.clamp(beam.start, slots="all")
+    for side in (1.0, -1.0):
+        b.add_point_load(beam.at((0.2, 0, 0.5 * side * height)), force=(side * F, 0, 0))
+    b.add_probe("tip", beam.end)
+    tape = wf.Adjoint(wf.solve_static(b.finalize(device="cpu"), load_steps=1, tol=1e-12), ["mesh.X", "body.E"])
+    w = tape.probe("tip").displacement.numpy()[0, 0, 2]
+    assert w == pytest.approx(-6.0 * F * 0.2**2 / (1e6 * 0.01 * height**2), rel=1e-8)
+    tape.probe("tip").displacement.grad.assign([[[0.0, 0.0, 1.0]]])
+    g = tape.backward()
+    by_slot = np.sum(g["mesh.X"].numpy()[0] * beam.reference, axis=1) / w
+    powers = [by_slot[beam.slot_kind == kind].sum() for kind in range(4)]
+    assert powers == pytest.approx([2.0, 0.0, -1.0, -2.0], abs=1e-8)
+    assert g["body.E"].numpy() * 1e6 / w == pytest.approx(-1.0, rel=1e-8)
+
+
 def test_terms_without_a_derivative_are_refused_by_name():
     ctx = SimpleNamespace(inertia=True, midpoint=False, dissipation=0.0)
     ctx.model = linked("motor")

@@ -168,7 +168,7 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
     def note_residual(ctl: Control, active: int_1d):
         """Record |r| / |right side| of the solution."""
         world = wp.tid()
-        if ctl.first_norm[world] > f64(0.0):
+        if ctl.first_norm[world] != f64(0.0):  # NaN is noted, too
             norm = ctl.norm[world]
             if wp.static(constrained):
                 norm = wp.sqrt(ctl.sums[0, world])

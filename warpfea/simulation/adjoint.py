@@ -84,11 +84,15 @@ class Adjoint(Tape):
         budget: int | None = None, folder: str | os.PathLike[str] | None = None,
     ) -> None:  # fmt: skip
         self.static = isinstance(sim, StaticResult)
+        if not isinstance(sim, (Simulation, StaticResult)):
+            raise ModelError(f"Adjoint: needs a Simulation or a result of solve_static, got {type(sim).__name__}")
         super().__init__(sim.simulation if isinstance(sim, StaticResult) else sim, budget, folder)
         m = self.model
         if not (isinstance(tol, float) and 0.0 < tol < 1.0):
             raise ModelError(f"Adjoint: tol = {tol!r} must lie between 0 and 1")
-        self.names = [with_respect_to] if isinstance(with_respect_to, str) else list(with_respect_to)
+        self.names = [with_respect_to] if isinstance(with_respect_to, str) else list(with_respect_to or ())
+        if not self.names:
+            raise ModelError("Adjoint: with_respect_to names no parameter")
         check_simulation(self.sim, self.static)
         check_terms(m, self.sim.stepper.ctx)
         with convert_memory_errors(f"an adjoint of {m.worlds} worlds", m.device):
@@ -183,8 +187,8 @@ class Adjoint(Tape):
 
         Returns:
             arrays [world] of constants, [world, 3] of gravity, [world, step, size] of controls (of statics [world,
-                size]), [world, slot] of initial values and "mesh.X"; NaN in worlds that failed or are frozen, at their
-                `t_end` too.
+                size]), [world, slot] of initial values and "mesh.X"; NaN in worlds that failed or are frozen, but
+                for those at their `t_end`.
             Their `switches`: how often contact changed, where derivatives are one-sided.
 
         Raises:
@@ -257,6 +261,11 @@ class Adjoint(Tape):
         if loss is not None:
             if isinstance(loss, Loss) and not any(loss.values is array for array in arrays):
                 raise ModelError("Adjoint: the loss is not of this tape's probes, taken since its last step")
+            if not callable(getattr(loss, "backward", None)):
+                raise ModelError(
+                    f"Adjoint: a loss is one of wf.loss or a torch scalar, got {type(loss).__name__}; of others, write "
+                    "the derivatives to the probes' .grad, then backward()"
+                )
             for array in arrays:
                 array.grad.zero_()
             loss.backward()
@@ -301,13 +310,13 @@ class Adjoint(Tape):
     def _check_result(self) -> np.ndarray:
         """Flags of the worlds that failed; ConvergenceError for a residual in others."""
         self.residual = self.solver.control.residual.numpy().copy()
-        failed = self.sim.status != STATUS["running"]
+        failed = (self.sim.status != STATUS["running"]) & ~self.ended
         worst = np.where(failed, 0.0, self.residual)
         if not (worst <= MAX_RESIDUAL).all():
             world = int(np.argmax(~(worst <= MAX_RESIDUAL)))
             raise ConvergenceError(
                 f"Adjoint: the residual of a solve is {worst[world]:.2g} in world {world}: its tangent is singular or "
-                "indefinite",
+                "indefinite, or derivatives of the loss are not finite",
                 world=world,
             )
         largest = float(np.max(self.growth, initial=0.0))

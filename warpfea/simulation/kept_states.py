@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.checks import check_positive
 from ..base.console import format_bytes
 from ..base.errors import CapacityError, ModelError
 from ..model.state import State
@@ -47,6 +48,8 @@ class KeptStates(list[dict[str, wp.array]]):
     ) -> None:
         super().__init__()
         self.sim, self.budget = sim, budget
+        if budget is not None:
+            check_positive("Adjoint", budget=budget)
         if folder is not None and not os.path.isdir(folder):
             raise ModelError(f"Adjoint: folder = {os.fspath(folder)!r} does not exist")
         self.controls = [control_array(name) for name in sim.model.terms.time_laws.controls]

@@ -49,9 +49,11 @@ def sum_of_squares(p: ProbeArrays | wp.array, record: Any, *, scale: float = 1.0
         record: (steps, 3) or (worlds, steps, 3), m, or a record of `Simulation.probe`; NaN: not recorded.
 
     Raises:
-        ModelError: another shape.
+        ModelError: another shape, or no probe.
     """
     values = p.displacement if isinstance(p, ProbeArrays) else p
+    if not isinstance(values, wp.array):
+        raise ModelError(f"sum_of_squares: needs a probe of a tape or one of its arrays, got {type(p).__name__}")
     host = np.asarray(record.displacement if isinstance(record, ProbeRecord) else record, dtype=float)
     host = host[None] if host.ndim == 2 else host
     if host.shape[1:] != values.shape[1:] or host.shape[0] not in (1, values.shape[0]):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..base.checks import float_array
 from ..base.errors import ModelError
 from ..base.names import listing
 from ..terms.checks import overrides
@@ -78,10 +79,15 @@ class ForwardSensitivities:
             shape: tuple[int, ...] = (m.worlds, tape.steps) if laws else (m.worlds,)
             shape = (m.worlds, m.slots, 3) if name not in self.changes else (*shape, tape.size_of(name))
             given = direction.get(name, 0.0)
-            values = np.asarray(given.numpy() if hasattr(given, "numpy") else given, dtype=float)
+            values = float_array(given.numpy() if hasattr(given, "numpy") else given)
             if name in self.changes and shape[-1] == 1 and values.ndim == len(shape) - 1:
                 values = values[..., None]
-            out[name] = np.broadcast_to(values, shape)
+            try:
+                out[name] = np.broadcast_to(values, shape)
+            except ValueError:
+                raise ModelError(f"Adjoint.forward: {name!r} has shape {values.shape}, not {shape}") from None
+            if not np.isfinite(values).all():
+                raise ModelError(f"Adjoint.forward: {name!r} has changes that are no finite numbers")
         return out
 
     def _empty(self, probe: ProbeArrays) -> ProbeArrays:

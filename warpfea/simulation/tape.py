@@ -18,7 +18,7 @@ from ..base.memory import convert_memory_errors
 from ..base.names import did_you_mean, listing
 from ..base.worlds import device_flags
 from ..kernels.solvers.adjoint import adjoint_kernels
-from ..kernels.step.step_control import STATUS
+from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
 from ..model.state import MONITOR_ARRAYS, is_solver_history
 from ..terms.time_law_table import control_array
 from .kept_states import KeptStates
@@ -84,6 +84,15 @@ class Tape:
         """Number of steps kept."""
         return len(self.ends)
 
+    @property
+    def ended(self) -> np.ndarray:
+        """Flags (worlds,) of worlds frozen at their `t_end`."""
+        sim = self.sim
+        if sim.t_end is None:
+            return np.zeros(self.model.worlds, dtype=bool)
+        there: np.ndarray = sim.time >= sim.t_end - SAME_TIME_FRACTION * sim.dt
+        return there & (sim.status == STATUS["frozen"])
+
     def parts(self, step: int) -> list[int]:
         """Indices of the parts of a step, backwards."""
         first = self.ends[step - 1] if step else 0
@@ -93,11 +102,13 @@ class Tape:
         """Advance the simulation, and keep its steps, after those kept so far unless it was reset since.
 
         Raises:
-            ModelError: parameters set since the first step; a static result.
+            ModelError: no positive whole number; parameters set since the first step; a static result.
             ConvergenceError: as `Simulation.step`. CapacityError: more bytes than the budget.
         """
         if self.static:
             raise ModelError("Adjoint: an equilibrium has no steps to run")
+        if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+            raise ModelError(f"run({steps!r}): the number of steps must be a whole number, at least 1")
         if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
             self.clear()
         self._check_state()
@@ -113,7 +124,7 @@ class Tape:
                 controls = self._controls()
                 self.kept.begin_step()
                 report, stepper = self.sim.step(), self.sim.stepper
-                running = self.sim.status == STATUS["running"]
+                running = (self.sim.status == STATUS["running"]) | self.ended
                 running &= self.kept[-1]["time"].numpy() != self.sim.time  # others were at their end
                 divided = running & ((report.halvings > 0) | bool(stepper.step_size_control))
                 if divided.any():
