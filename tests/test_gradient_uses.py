@@ -39,7 +39,7 @@ def test_gradients_beside_other_software():
     assert max(ours["error"], theirs["error"]) < 1e-6
     assert ours["forward_s"] + ours["backward_s"] < theirs["forward_s"] + theirs["backward_s"]
     ours, theirs = rows["soft body", "warpfea"], rows["soft body", "newton"]
-    assert ours["error"] < max(theirs["error"])  # with points that come into contact, neither is smooth
+    assert ours["error"] < 1e-6 < max(theirs["error"])  # with points that come into contact, neither is smooth
     assert ours["forward_s"] + ours["backward_s"] < theirs["forward_s"] + theirs["backward_s"]
 
 

@@ -14,7 +14,7 @@ from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set,
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import f64, precision, vec3d
 from .facet_structs import point_list_struct
-from .friction import friction_functions
+from .friction import EXACT_TOLERANCE, TOUCHING_PART_UPDATES, friction_functions
 from .kinematics import GEOMETRIES, kinematics_functions
 from .law import ANY_GAP, OwnLaws, law_names
 from .structs import FORCE_ONLY, FREE, INACTIVE, PASSED, TURNED, WITH_STIFFNESS, contact_structs
@@ -58,6 +58,7 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
         if q == 0 and item == 0 and facets.first_row == 0:
             scr.passed_point[world] = 0
             scr.limit_updates[world] = 0
+            scr.most_part_change[world] = f64(1.0)
             if clock.substep_index[world] == 0:
                 scr.elapsed_time[world] = f64(0.0)
         if facets.area[q, item] > f64(0.0):
@@ -206,7 +207,11 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
             unsettled[world] = 1
         scr.relaxation[world] = omega
         scr.aitken_norm2[world] = total[2]
-        scr.limit_updates[world] = scr.limit_updates[world] + 1
+        count = scr.limit_updates[world] + 1
+        scr.limit_updates[world] = count
+        if count >= TOUCHING_PART_UPDATES:
+            most = wp.pow(f64(SLOW_REDUCTION), f64(count - TOUCHING_PART_UPDATES + 1))
+            scr.most_part_change[world] = wp.where(tol > f64(EXACT_TOLERANCE), f64(0.0), most)
 
     @masked_kernel(module, "flags")
     def update_frozen(flags: wp.array(dtype=wp.int32), scr: ContactScratch):

@@ -41,12 +41,15 @@ from .law import (
 )
 from .structs import SLIP_FLAG, contact_structs, world_value
 
-__all__ = ["friction_functions"]
+__all__ = ["EXACT_TOLERANCE", "TOUCHING_PART_UPDATES", "friction_functions"]
 
-TOUCHING_PART_REDUCTION = 0.1
-"""Largest change, per update after the second of an attempt, of the part of the step that a new point is in contact;
-larger ones are not taken. By that part friction in stick follows the normal force, as a coefficient does: it settles
-with the iterates, but where two points wedge a body its updates diverge (by 1.05 each in a chain of links)."""
+TOUCHING_PART_UPDATES = 2
+"""Updates in an attempt of the part of the step that a new point is in contact. By that part friction in stick follows
+the normal force, as a coefficient does: updates to the end diverge where two points wedge a body (by 1.05 each in a
+chain of links)."""
+EXACT_TOLERANCE = 1e-9
+"""Relative tolerance of a step at or below which that part follows to the end, where its changes fall: gradients are
+those of converged steps. An eighth more iterations where a stiff bar lands and sticks."""
 
 
 @functools.cache
@@ -210,7 +213,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     ) -> vec3d:  # fmt: skip
         """Store friction limit, k_t, factor on the stored elastic slip, and normal of an iterate for the next frozen
         update. Returns the frozen three; `fresh`: they and the normal are set to those of the iterate, with at most the
-        limit of the last step: zero for a new contact. The factor stays where it does not settle."""
+        limit of the last step: zero for a new contact. The factor of a point stays after a few updates."""
         rec = k.history_row(con, c, point)
         frozen = scr.frozen_friction[world, rec]
         new = friction_parameters(con, his, world, c, point, t)
@@ -224,8 +227,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
                 scr.predicted_friction[world, point] = (new[1] / his.friction_limit[world, rec]) * t.spring
         elif con.single_point[c] == 0:  # a point that has come to another side since
             frozen[1] = new[1]
-            most = wp.pow(f64(TOUCHING_PART_REDUCTION), f64(scr.limit_updates[world] - 1))
-            if frozen[0] > f64(0.0) and wp.abs(new[2] - frozen[2]) > most:
+            if frozen[0] > f64(0.0) and wp.abs(new[2] - frozen[2]) > scr.most_part_change[world]:
                 new[2] = frozen[2]
         scr.updated_normal[world, rec] = t.normal
         scr.updated_friction[world, rec] = new

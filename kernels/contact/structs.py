@@ -210,6 +210,7 @@ def contact_scratch_struct(dtype: str):
         relaxation: wp.array(dtype=wp.float64)  # [world] relaxation factor
         aitken_norm2: wp.array(dtype=wp.float64)  # [world] sum of squares of the last r
         limit_updates: wp.array(dtype=wp.int32)  # [world] updates in this attempt
+        most_part_change: wp.array(dtype=wp.float64)  # [world] of the factor on the motion of a point new in contact
         activity: wp.array2d(dtype=wp.int32)  # [world, point] INACTIVE, FORCE_ONLY or WITH_STIFFNESS
         force: wp.array2d(dtype=wp.vec3d)  # on the residual, N, unless INACTIVE
         energy: wp.array2d(dtype=wp.vec2d)  # potential, and the magnitude of its terms, J

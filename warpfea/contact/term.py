@@ -117,7 +117,8 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             "aitken_sums": (B, AITKEN_LANES), "record_totals": (B, len(t.contacts), len(RECORD_NAMES)),
             "record_rows": (len(RECORD_NAMES), B, t.rows), "facet_activity": (B, t.rows), "shape_values": (1, 1, 1),
         }  # fmt: skip
-        shapes |= dict.fromkeys(("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2"), (B,))
+        of_worlds = "passed_point", "elapsed_time", "relaxation", "limit_updates", "most_part_change", "aitken_norm2"
+        shapes |= dict.fromkeys(of_worlds, (B,))
         shapes |= dict.fromkeys(OF_FACETS, (B, t.rows)) | dict.fromkeys(OF_CONTACTS, (B, len(t.contacts)))
         if t.has_single_point:
             shapes["shape_values"] = (B, len(t.contacts), max(group.conn.shape[1] for group in t.groups))
