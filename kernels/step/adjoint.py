@@ -183,8 +183,8 @@ def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> Kern
         """w = (change of the position)/d of prescribed components, 0 of others."""
         world, slot = wp.tid()
         scale = T(1.0) / T(step_coefficients(step, world).dq_dv)
-        prescribed = q[world, slot] - wp.cw_mul(free[slot] + driven[slot], q[world, slot])
-        w[world, slot] = scale * (prescribed + wp.cw_mul(driven[slot], drive[world, slot]))
+        prescribed_change = q[world, slot] - wp.cw_mul(free[slot] + driven[slot], q[world, slot])
+        w[world, slot] = scale * (prescribed_change + wp.cw_mul(driven[slot], drive[world, slot]))
 
     @masked_kernel(module, "active")
     def change_side(step: Step, topo: Topology, x: p.vec3_2d, force: p.vec3_2d, active: int_1d, out: p.vec3_2d):

@@ -100,9 +100,8 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     def build(self, laws: TimeLawTable) -> None:
         self.tables.build(laws, self.offset)
         self.connectivity = self.tables.connectivity
-        self.double_displacements = (
-            DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
-        )
+        single = self.model.dtype == "float32"
+        self.double_displacements = DoubleDisplacements(self.model, self.connectivity) if single else None
         self.rows = self.increment_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
