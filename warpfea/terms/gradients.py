@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from ..base.console import quiet_warp
-from ..base.launch import load_modules
+from ..base.launch import Launcher, load_modules
 from ..kernels.common.structs import topology_struct
 from ..kernels.elements.assumed_strain_block import assumed_strain_struct
 from ..kernels.elements.materials import NCOEF
@@ -87,6 +87,11 @@ class StepAdjoint:
     def add_predictor_bar(self, x: wp.array) -> None:
         """Add bars x of q~ to those of the state at the start."""
         self.solver.add_predictor_bar(x, self.active)
+
+    @property
+    def launch(self) -> Launcher:
+        """Launches kernels."""
+        return self.ctx.launch
 
     @property
     def active(self) -> wp.array:
