@@ -8,6 +8,7 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import mass_functions, topology_struct
 from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, precision, vec3d, vec3d_1d, vec3d_2d
 from ..terms.constraints import ANGLE, constraint_functions, constraint_struct, multiplier_struct
+from .newton_control import control_struct
 
 __all__ = ["adjoint_kernels", "adjoint_struct"]
 
@@ -42,7 +43,7 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
     """Kernels in one precision; `constrained`: with rows of constraints."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    Control, Topology = adjoint_struct(), topology_struct(dtype)
+    Control, Newton, Topology = adjoint_struct(), control_struct(), topology_struct(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     mass_times, functions = mass_functions(dtype).mass_times, constraint_functions(dtype)
     module = kernel_module(f"adjoint_{dtype}{'_constrained' if constrained else ''}")
@@ -76,9 +77,10 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
         rows[1, world, slot] = squared_norm(free[slot], rhs[world, slot], diagonal[world, slot])
 
     @wp.kernel(module=module)
-    def check_residual(ctl: Control, start: int, least_forcing: f64, forcing: double_1d, active: int_1d):
+    def check_residual(ctl: Control, start: int, least_forcing: f64, newton: Newton, active: int_1d):
         """Continue while |r| exceeds the tolerance and falls by half, with solves to half of the tolerance.
 
+        The first solve takes the solution of exact factors, others check it by conjugate gradients.
         `start`: 1: the tolerance is relative to |r|; 2: to the right side, w being extrapolated.
         """
         world = wp.tid()
@@ -95,7 +97,8 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
             last = f64(1.0e300)
         ctl.norm[world] = norm
         target = f64(0.5) * ctl.tol * ctl.first_norm[world]
-        forcing[world] = wp.max(least_forcing, target / wp.max(norm, target))
+        newton.solve.forcing[world] = wp.max(least_forcing, target / wp.max(norm, target))
+        newton.iterations[world] = wp.where(start != 0, 0, newton.max_iterations)
         count = ctl.refinements[world]
         ctl.refinements[world] = count + 1
         more = norm > ctl.tol * ctl.first_norm[world] and count < MAX_REFINEMENTS

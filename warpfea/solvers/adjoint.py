@@ -225,7 +225,6 @@ class AdjointSolver:
         newton, active = w.newton, w.newton.active
         for flags in (newton.norms.component_converged, newton.floor.estimate_error, newton.solve.predicted_stress):
             flags.zero_()
-        newton.iterations.zero_()  # the solution of exact factors is taken; `_check` makes the product
         w.pcg.step_iterations.zero_()
         wp.copy(active, self.running)
         if self.symmetric or self.newton.plan.factors_operator:
@@ -277,7 +276,6 @@ class AdjointSolver:
         self.newton.preconditioner.prepare(active)
         self.linear.solve(active)
         self.newton.preconditioner.record_cost()
-        w.newton.iterations.fill_(w.newton.max_iterations)  # refinements check it
         launch(k.add_direction, self.dim, [w.direction, active, self.w])
         self._product()
         if self.constrained:
@@ -289,7 +287,7 @@ class AdjointSolver:
         self._evaluate_residual()
         self.control.any_active.zero_()
         newton = self.work.newton
-        args = [self.control, start, wp.float64(self.least_forcing), newton.solve.forcing, newton.active]
+        args = [self.control, start, wp.float64(self.least_forcing), newton, newton.active]
         self.launch(self.kernels.check_residual, self.model.worlds, args)
 
     def _evaluate_residual(self) -> None:
