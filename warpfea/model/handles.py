@@ -103,10 +103,10 @@ def once_per_surface(function: F) -> F:
     known: weakref.WeakKeyDictionary[Discretisation, dict[Any, Any]] = weakref.WeakKeyDictionary()
 
     @functools.wraps(function)
-    def remembered(surface: SurfaceSet, *values: Any, **named: Any) -> Any:
-        of_body, key = known.setdefault(surface.body, {}), (surface.faces.tobytes(), values, *named.items())
-        if key not in of_body:
-            of_body[key] = function(surface, *values, **named)
-        return of_body[key]
+    def wrapper(surface: SurfaceSet, *values: Any, **named: Any) -> Any:
+        found, key = known.setdefault(surface.body, {}), (surface.faces.tobytes(), values, *named.items())
+        if key not in found:
+            found[key] = function(surface, *values, **named)
+        return found[key]
 
-    return remembered  # type: ignore[return-value]
+    return wrapper  # type: ignore[return-value]
