@@ -23,7 +23,7 @@ def test_a_stiff_part_comes_to_rest(height):
     assert force.mean() == pytest.approx(block.mass * GRAVITY, rel=1e-3)
 
 
-@pytest.mark.parametrize("scheme", ["backward_euler", "bdf2", "generalized_alpha"])
+@pytest.mark.parametrize("scheme", ["backward_euler", "bdf2", "generalized_alpha", "energy_momentum"])
 def test_restitution_0_returns_nothing(scheme):
     """Rigid parts stop, at steps of half and twice the time of the wave through them; no step is
     refused for energy that an integrator adds."""

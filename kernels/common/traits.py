@@ -1,6 +1,6 @@
 """Traits of a model's terms that specialise the kernels of a step: absent terms cost nothing."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 __all__ = ["NO_TERMS", "Traits"]
 
@@ -18,6 +18,7 @@ class Traits(NamedTuple):
         limited: terms may shorten a Newton step.
         unilateral: terms have unilateral forces, such as contact.
         impacts: terms may stop a body within a step.
+        plastic: such impacts may leave no speed, of which mid-point schemes are no model.
         midpoint: of the integrator: forces are those at the midpoint of a step and have no potential in its end state.
     """
 
@@ -30,7 +31,12 @@ class Traits(NamedTuple):
     limited: bool = False
     unilateral: bool = False
     impacts: bool = False
+    plastic: bool = False
     midpoint: bool = False
+
+    def takes_again(self, scheme: Any) -> bool:
+        """True if attempts of an integrator that do not resolve an impact are taken again by backward Euler."""
+        return (self.impacts and (scheme.multistep or scheme.accelerated)) or (self.plastic and scheme.midpoint)
 
     def suffix(self, *names: str) -> str:
         """Module name suffix of those traits in `names` that are set."""

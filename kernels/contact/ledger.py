@@ -169,10 +169,10 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
     @wp.kernel(module=module)
     def find_impacts(
         con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
-        running: wp.array(dtype=wp.int32), failed: wp.array(dtype=wp.int32), scr: ContactScratch,
+        running: wp.array(dtype=wp.int32), failed: wp.array(dtype=wp.int32), scr: ContactScratch, only_plastic: int,
         impact: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """Flag worlds whose converged attempt stops a point within the substep."""
+        """Flag worlds whose converged attempt stops a point within the substep; `only_plastic`: of restitution 0."""
         world, item = wp.tid()
         seen = impact[world] == IMPACT_FOUND or impact[world] >= IMPACT_REPEATED
         if running[world] == 0 or failed[world] != 0 or seen:
@@ -191,6 +191,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
                     if (stiffness - rate) * wp.abs(now - before) > f64(0.1) * stiffness * wp.max(now, before):
                         impact[world] = IMPACT_FOUND
                 sudden = t.depth > f64(2.0) * t.previous_depth and t.depth * inv_h < f64(IMPACT_DEPTH) * speed
+                sudden = sudden and only_plastic == 0
                 if t.state == IN_REACH and t.depth > f64(0.0) and sudden:
                     momentum = world_value(con.effective_mass, world, c) * speed
                     force = law.with_normal_force(con, scr, world, c, point, t, inv_h).normal_values[0]

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, int_1d, precision
+from ..common.types import double_1d, f64, int_1d, precision
 
 __all__ = ["midpoint_kernels"]
 
@@ -22,6 +22,7 @@ def midpoint_kernels(dtype: str) -> KernelSet:
         u_n: p.vec3_2d,
         v_n: p.vec3_2d,
         v: p.vec3_2d,
+        b: double_1d,
         dq_dv: double_1d,
         active: int_1d,
         u_stage: p.vec3_2d,
@@ -30,6 +31,8 @@ def midpoint_kernels(dtype: str) -> KernelSet:
         """Half of the change of u, (dq/dv) (v_n + v)/2, and u at the midpoint, m; without differences of positions."""
         world, slot = wp.tid()
         half = (T(0.5) * T(dq_dv[world])) * (v_n[world, slot] + v[world, slot])
+        if b[world] == f64(0.0):  # backward Euler
+            half = (T(0.5) * T(dq_dv[world])) * v[world, slot]
         u_stage[world, slot] = u_n[world, slot] + half
         v_stage[world, slot] = half
 

@@ -47,7 +47,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
     MAX_GROWTH = MAX_STEP_GROWTH[dtype]
-    impacts = traits.impacts and (multistep or accelerated)
+    impacts = traits.takes_again(scheme)
     variant = traits.suffix("nonpotential", "has_constraints", *(("impacts",) if impacts else ()))
     module = kernel_module(f"step_{dtype}_{scheme.kernel_variant}{variant}")
 

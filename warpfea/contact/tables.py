@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MATERIAL_CONSTANTS", "POINT_SUM_LANES", "TOUCHING_DEPTH_RATIO", "WORLD_PARAMETERS", "FacetTables", "bodies_of",
     "check_chosen_values", "clamped_slots", "contact_constants", "hunt_crossley_damping", "normal_damping",
-    "restitution_beta", "restitution_slopes",
+    "restitution_beta", "restitution_slopes", "speed_damping",
 ]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, FacetOptions)

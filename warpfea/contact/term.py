@@ -33,7 +33,7 @@ from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Touching,
 from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .collider_tables import facet_pattern_entries
 from .evaluation import CONTACT_FIELDS, reference_position_text
-from .tables import POINT_SUM_LANES
+from .tables import POINT_SUM_LANES, speed_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -303,12 +303,18 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         ctx.scratch[self.name]["finished"] = True
         return ctx.scratch[self.name]["energies"]
 
+    @property
+    def plastic(self) -> bool:  # type: ignore[override]
+        """Rigid parts may be stopped by restitution 0."""
+        return any(speed_damping(contact, 0.0) < -1.0 for contact in self.tables.contacts)
+
     @part("commit")
     def find_impacts(self, ctx: StepContext) -> None:
         s, t, w, B = ctx.scratch[self.name], self.tables, ctx.work, self.model.worlds
         for group in t.groups:
             args = [t.data, s["other"], group.data, s["history"], s["clock"], s["u"], w.step.running, w.newton.failed]
-            ctx.launch(self.ledger_kernels.find_impacts, (B, group.count), [*args, s["attempt"], w.step.impact])
+            args += [s["attempt"], int(ctx.midpoint), w.step.impact]
+            ctx.launch(self.ledger_kernels.find_impacts, (B, group.count), args)
 
     @part()
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:

@@ -27,7 +27,7 @@ class Predictor:
         *, scheme: Integrator,
     ) -> None:  # fmt: skip
         self.model, self.work, self.launch, self.reduce, self.state = model, work, launch, reduce, state
-        impacts = model.terms.traits.impacts and (scheme.multistep or scheme.accelerated)
+        impacts = model.terms.traits.takes_again(scheme)
         self.kernels = predictor_kernels(model.dtype, scheme.accelerated, impacts, module)
         self.dim = (model.worlds, model.slots)
         self.control: Any = predictor_struct()()

@@ -141,14 +141,15 @@ class Stepper:
             w.step.b = w.array("b", (self.model.worlds,), wp.float64)
         if self.integrator.accelerated:
             w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
+        midpoint, terms = self.integrator.midpoint, self.terms.having(Impacting)
         self.impact_terms: list[Impacting] = []
+        if self.terms.traits.takes_again(self.integrator):
+            self.impact_terms = [term for term in terms if (term.plastic if midpoint else term.impacts)]
+            w.step.impact = w.array("impact", (self.model.worlds,), wp.int32)
+        if self.impact_terms or self.integrator.accelerated:
+            w.step.acceleration_step = w.array("h_before", (self.model.worlds,), wp.float64)
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
-            self.impact_terms = [term for term in self.terms.having(Impacting) if term.impacts]
-            if self.impact_terms:
-                w.step.impact = w.array("impact", (self.model.worlds,), wp.int32)
-            if self.impact_terms or self.integrator.accelerated:
-                w.step.acceleration_step = w.array("h_before", (self.model.worlds,), wp.float64)
             w.step.previous_end_time = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time

@@ -192,7 +192,7 @@ class Residual:
         w, state = self.work, self.ctx.state
         self.launch(self.vector_kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.ctx.midpoint:
-            args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
+            args = [state.displacement, state.velocity, w.v, w.step.b, w.step.dq_dv, active, w.u_stage, w.v_stage]
             self.launch(self.midpoint_kernels.evaluate_midpoint, self.dim, args)
 
     @launch_part("residual")

@@ -93,6 +93,7 @@ def derived_traits(term: Term) -> Traits:
         limited=overrides(term, Updated.process_direction),
         unilateral=overrides(term, Updated.update_frozen),
         impacts=isinstance(term, Impacting) and term.impacts,
+        plastic=isinstance(term, Impacting) and term.plastic,
     )
 
 

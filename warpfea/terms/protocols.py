@@ -225,9 +225,11 @@ class Impacting(Term):
 
     Attributes:
         impacts: False if those of the model can't.
+        plastic: True if impacts may leave no speed: `find_impacts` is called in mid-point schemes, too.
     """
 
     impacts = True
+    plastic = False
 
     def find_impacts(self, ctx: StepContext) -> None:
         """Set `impact` of the step control to IMPACT_FOUND in worlds whose attempt does not resolve an impact."""
