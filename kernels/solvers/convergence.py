@@ -313,16 +313,16 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             near = True
             settling = True
         if wp.static(traits.has_constraints):  # a part at rest on another, or in free flight, has no energy to compare
-            below_rounding = ctl.floor.rounding_ratio[world] <= f64(1.0)
+            bare = ctl.is_static == 0
             if wp.static(traits.unilateral):
-                below_rounding = below_rounding and ctl.floor.eps < f64(SINGLE_PRECISION_EPS)
-            settling = settling or below_rounding
+                bare = ctl.floor.eps < f64(SINGLE_PRECISION_EPS)
+            settling = settling or (bare and ctl.floor.rounding_ratio[world] <= f64(1.0))
         near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         still = ctl.norms.residual_reduction[world] > f64(STALL_RATIO) and ctl.solve.operator_reused[world] == 0
         done = ctl.norms.ratio[world] <= f64(1.0)
         if wp.static(traits.has_constraints and not traits.unilateral):  # a thousandth of a rounding moves no position
             fixed = f64(STALL_ROUNDINGS) * ctl.floor.rounding_ratio[world] <= f64(1.0)
-            done = done or (fixed and ctl.iterations[world] > 0)
+            done = done or (fixed and ctl.iterations[world] > 0 and ctl.is_static == 0)
         if done:
             accept_iterate(ctl, world)
         elif near and ctl.iterations[world] > 0 and still and settling:
