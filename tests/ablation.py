@@ -66,7 +66,7 @@ MECHANISMS: dict[str, tuple[Change, ...]] = {
         (CONVERGENCE, "near = at_roundoff and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),
     ),
     "candidate starts": ((NEWTON, "if is_poor_first_iterate(ctl, world):", "if False:"),),
-    "rest below round-off": ((CONVERGENCE, "settling = settling or below_rounding", "settling = settling"),),
+    "rest below round-off": ((CONVERGENCE, "settling = settling or (bare and", "settling = settling or (False and"),),
     "doublings": ((SEARCH, "longer = (\n            good\n", "longer = (\n            False\n"),),
 }
 """Mechanisms of globalisation -> changes that switch them off."""
