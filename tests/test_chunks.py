@@ -37,19 +37,22 @@ def stack(**_):
 @pytest.mark.parametrize("preconditioner", ["two-level", "banded"])
 @pytest.mark.parametrize("build", [beam, joints, stack])
 def test_chunks_change_no_bit(build, preconditioner, monkeypatch):
-    def run():
+    def run(enlarged=False):
         m = build()
         m.set_gravity([(0.3 * world, 0.0, -9.81) for world in range(WORLDS)])
         solver = wf.NewtonPCG(preconditioner=preconditioner)
-        sim = wf.Simulation(m, dt=2e-3, solver=solver, record=False)
+        sim = wf.Simulation(m, dt=2e-3, solver=solver, record=False, capture=not enlarged)
+        if enlarged:
+            sim.stepper.newton.residual.assembler.enlarge_chunks(WORLDS * sim.bytes()["work.element matrices"] // 2)
         sim.step(4)
         return sim.state.numpy(), sim.bytes()
 
     whole, bytes_whole = run()
     monkeypatch.setattr(matrix_assembly, "MIN_CHUNK_WORLDS", 2)
     monkeypatch.setattr(matrix_assembly, "MAX_CHUNKS", 3)
-    state, bytes_now = run()
-    for name, values in whole.items():
-        assert np.array_equal(state[name], values, equal_nan=True), name
     name = "work.element matrices"
-    assert 5 * bytes_now[name] == 2 * bytes_whole[name]
+    for enlarged in (False, True):
+        state, bytes_now = run(enlarged)
+        for key, values in whole.items():
+            assert np.array_equal(state[key], values, equal_nan=True), key
+        assert 5 * bytes_now[name] == (5 if enlarged else 2) * bytes_whole[name]

@@ -122,6 +122,9 @@ class AdjointSolver:
             self.linear = BiCGStab(m, w, self.launch, operator, newton.preconditioner,
                 max_iterations=w.pcg.max_iterations, max_work=w.pcg.max_work, deflate=False)  # fmt: skip
             newton.pcg = self.linear
+        assembler = newton.residual.assembler
+        if assembler and newton.residual.uses_matrix and self.symmetric:  # it is assembled in each step
+            assembler.enlarge_chunks()
         self.mu = w.array("adjoint mu", (m.worlds, tables.count if tables else 1), wp.float64)
         count = (MAX_ORDER + 1, m.worlds)
         self.control: Any = w.struct(adjoint_struct(), m.worlds, sums=(3, m.worlds), difference_sums=count)

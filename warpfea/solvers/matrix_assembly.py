@@ -118,6 +118,9 @@ def coupling_pattern(model: Model) -> sp.csr_matrix:
 MIN_CHUNK_WORLDS, MAX_CHUNKS = 512, 16
 """Worlds assembled at once: at least MIN_CHUNK_WORLDS, and enough for at most MAX_CHUNKS passes."""
 
+MAX_SCRATCH_BYTES = 2**28
+"""Scratch of enlarged chunks: a bound that is small beside the states that an adjoint keeps."""
+
 
 def worlds_per_chunk(worlds: int) -> int:
     """Number of worlds assembled at once."""
@@ -150,12 +153,23 @@ class MatrixAssembler:
         if name not in model.cache:
             model.cache[name] = [self._list_contributions(parts[0][0]) for parts in self.blocks_by_elements]
         self.contributions: list[tuple[wp.array, wp.array]] = model.cache[name]
-        self.worlds_per_chunk = worlds_per_chunk(model.worlds)
         vectors = max(self._element_matrices_size(block) for block in model.blocks)
         points = 0 if self.whole_elements else max(5 * block.points * block.count for block in model.blocks)
-        work.chunks |= dict.fromkeys(("element gradients", "element matrices"), worlds_per_chunk)
-        self.element_gradients = work.array("element gradients", (self.worlds_per_chunk, points), model.types.vec3)
-        self.element_matrices = work.array("element matrices", (self.worlds_per_chunk, vectors), model.types.vec3)
+        self.scratch_sizes = {"element gradients": points, "element matrices": vectors}
+        work.chunks |= dict.fromkeys(self.scratch_sizes, worlds_per_chunk)
+        self._allocate_scratch(worlds_per_chunk(model.worlds))
+
+    def _allocate_scratch(self, worlds: int) -> None:
+        self.worlds_per_chunk, vec3 = worlds, self.model.types.vec3
+        arrays = [self.work.array(name, (worlds, size), vec3) for name, size in self.scratch_sizes.items()]
+        self.element_gradients, self.element_matrices = arrays
+
+    def enlarge_chunks(self, most: int = MAX_SCRATCH_BYTES) -> None:
+        """Assemble as many worlds at once as scratch of `most` bytes holds: fewer launches, for more memory."""
+        each = sum(self.scratch_sizes.values()) * wp.types.type_size_in_bytes(self.model.types.vec3)
+        worlds = min(self.model.worlds, most // each)
+        if worlds > self.worlds_per_chunk:
+            self._allocate_scratch(worlds)
 
     def _make_pattern_and_mass(self) -> tuple[Pattern, wp.array]:
         """Build the pattern and the masses of its upper entries."""
