@@ -18,7 +18,7 @@ from scenes.pendulum import pendulum
 from warpfea.base.provenance import provenance_of
 from warpfea.studies.identify import finger
 
-STEPS, ROUNDS = {"cpu": 100, "cuda": 60}, {"cpu": 5, "cuda": 1}
+STEPS, ROUNDS = {"cpu": 100, "cuda": 60}, {"cpu": 5, "cuda": 3}
 SCENES = {
     "pendulum": (pendulum, ["beam.E", "beam.density", "gravity"], "tip", 2e6),
     "finger": (finger, ["finger.E", "finger.eta", "gravity"], "tip", 1e6),
@@ -69,6 +69,7 @@ def row(name, device, worlds):
         "tol": scene.tol, "parameters": names, "setup_s": compile_s, "newton": float(newton / steps / worlds),
         "forward_ms": ms["forward"], "recorded_ms": ms["kept"], "backward_ms": ms["backward"],
         "ratio": ms["backward"] / ms["forward"], "recomputed": 0,
+        "matrix": tape.stepper.newton.residual.uses_matrix,
     }  # fmt: skip
 
 
