@@ -109,10 +109,10 @@ def test_products_of_the_adjoint():
     for name, add in cases.items():
         m = models.model(add, models.material())
         plans = choose_solver(m, m.device), choose_solver(m, gpu, many=True)
-        found[name] = [choose_adjoint_operator(m, plan) for plan in plans]
-    assert found == {"T10": ["elements", "elements"], "T4": ["auto", "auto"], "3243": ["auto", "auto"]}
+        found[name] = [choose_adjoint_operator(m, plan, on_cuda) for plan, on_cuda in zip(plans, (False, True))]
+    assert found == {"T10": ["elements", "elements"], "T4": ["auto", "auto"], "3243": ["auto", "elements"]}
     m = linked("motor")
-    assert choose_adjoint_operator(m, choose_solver(m, m.device)) == "auto"
+    assert choose_adjoint_operator(m, choose_solver(m, m.device), False) == "auto"
 
 
 def run_with(budget=None, folder=None, steps=30):

@@ -118,7 +118,7 @@ class Adjoint(Tape):
         keys = ("preconditioner", "preconditioner_dtype", "penalty", "operator")
         own = {key: getattr(given, key) for key in keys} if isinstance(given, NewtonPCG) else {}
         if own.get("operator") == "auto":
-            own["operator"] = choose_adjoint_operator(m, self.sim.plan)
+            own["operator"] = choose_adjoint_operator(m, self.sim.plan, m.device.is_cuda)
         options = NewtonPCG(max_pcg=MAX_PCG, max_work=MAX_WORK, max_halvings=0, **own)
         self.state = m.state()
         self.stepper = s = Stepper(

@@ -149,14 +149,14 @@ def choose_operator(model: Model, options: NewtonPCG, kind: str, scheme: str, on
     return "clusters" if all(block.with_mass for block in model.blocks) else "elements"
 
 
-def choose_adjoint_operator(model: Model, plan: SolverPlan) -> str:
+def choose_adjoint_operator(model: Model, plan: SolverPlan, on_cuda: bool) -> str:
     """Option `operator` of the adjoint of steps with a plan, whose matrix would be that of each step.
 
     Beside banded factors kept over steps a solve takes 3 to 8 products. A matrix of T10 costs as much as 15; one of T4
     less than the solve. One of beams costs less than their products on a CPU, and more on a GPU (a step back of 4096
     pendulums on an H200: 5.1 ms with it, 4.6 ms without).
     """
-    cheaper = all((block.with_mass or model.device.is_cuda) and block.slots > 4 for block in model.blocks)
+    cheaper = all((block.with_mass or on_cuda) and block.slots > 4 for block in model.blocks)
     kept = plan.preconditioner == "banded" and not model.terms.traits.constraint_rows
     return "elements" if cheaper and kept else "auto"
 
