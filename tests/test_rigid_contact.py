@@ -133,3 +133,27 @@ def test_critical_speed_of_a_gyroscope_on_a_flexible_shaft():
     trial = critical * np.linspace(0.8, 1.2, 801)
     power = np.abs(np.exp(-1j * np.outer(trial, t)) @ (signal * np.hanning(len(t))))
     assert trial[np.argmax(power)] == pytest.approx(critical, rel=1e-2)
+
+
+def test_dampers_in_steps_that_impacts_set_to_backward_euler():
+    """While boxes fall again and again: a damped slide has v exp(-c t/m), and a damped cube swings as beside none."""
+    swings = []
+    for count in (0, 2):
+        b = wf.ModelBuilder()
+        for k in range(count):
+            box = b.add_rigid(wf.Box((0.3 * k, 0, 0.0505 + 0.02 * k), (0.1, 0.1, 0.1)), mass=1.0)
+            b.add_contact(box, b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.3)
+            b.set_initial(box, velocity=(0, 0, -1), angular_velocity=(5 * k, 3, 0))
+        part = b.add_rigid(wf.Box((0, 3, 1), (0.1, 0.1, 0.1)), mass=1.0)
+        slide = b.add_joint("translational", parent=wf.GROUND, child=part.at((0, 3, 1)), axis=(1, 0, 0), damping=1.0)
+        b.set_initial(part, velocity=(2, 0, 0))
+        cube = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), origin=(0, 5, 1)), material=wf.SVK(
+            E=1e5, nu=0.0, density=1000.0, damping=wf.KelvinVoigt(eta=1e4, lambda_v=0.0)))  # fmt: skip
+        b.clamp(cube.nodes("z-"))
+        b.set_initial(cube, velocity=lambda X: 5.0 * (X[:, 2:] - 1.0) * (1.0, 0.0, 0.0))
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=5e-3, integrator="energy_momentum")
+        sim.run(0.2)
+        assert sim.joint_rate(slide)[0] == pytest.approx(2 * np.exp(-0.2), rel=1e-3)
+        assert sim.joint_value(slide)[0] == pytest.approx(2 - 2 * np.exp(-0.2), rel=1e-3)
+        swings.append(sim.displacements(cube)[0])
+    assert np.abs(swings[1] - swings[0]).max() < 0.01 * np.abs(swings[0]).max()

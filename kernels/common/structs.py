@@ -18,9 +18,9 @@ __all__ = [
     "topology_struct",
 ]
 
-IMPACT_FOUND, RESTART_FOUND, IMPACT_REPEATED, RESTART_REPEATED = 1, 2, 3, 4
-"""Values of `impact` of the step control: the attempt does not resolve an impact, or what the scheme remembers of the
-step before does not fit its forces; it is taken again for that reason, by backward Euler."""
+RESTART_FOUND, IMPACT_FOUND, RESTART_REPEATED, IMPACT_REPEATED = 1, 2, 3, 4
+"""Values of `impact` of the step control: what the scheme remembers of the step before does not fit the forces of the
+attempt, or it does not resolve an impact; for the larger one that is found it is taken again, by backward Euler."""
 
 
 @functools.cache

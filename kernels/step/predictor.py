@@ -9,7 +9,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.structs import IMPACT_REPEATED, free_components_function
+from ..common.structs import RESTART_REPEATED, free_components_function
 from ..common.types import double_3d, f64, precision
 from ..solvers.newton_control import control_struct
 from .step_control import step_struct
@@ -62,7 +62,7 @@ def predictor_kernels(dtype: str, accelerated: bool, impacts: bool, module: wp.M
         if step.running[world] == 0:
             return
         if wp.static(impacts):
-            if step.impact[world] >= IMPACT_REPEATED:
+            if step.impact[world] >= RESTART_REPEATED:
                 return
         if predictor.history_state[world, 2] == step.h[world] and predictor.history_state[world, 3] == step.time[world]:
             predictor.order[world] = int(predictor.history_state[world, 0])

@@ -59,7 +59,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         c.dq_dv = step.h[world]
         c.mass_factor = f64(1.0) / step.h[world]
         if wp.static(impacts):
-            if step.impact[world] >= IMPACT_REPEATED:
+            if step.impact[world] >= RESTART_REPEATED:
                 return c
         return coefficients(step.h[world], previous, step.scheme_parameter)
 
@@ -126,6 +126,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         step.new_time[world] = step.step_start_time[world] + span * (f64(step.substep_index[world] + 1) / parts)
         if wp.static(midpoint):
             step.stage_time[world] = step.new_time[world] - f64(0.5) * h
+            step.rate_time[world] = f64(0.5) * h
         previous = f64(0.0)
         if wp.static(multistep):
             # a state that was set, reset or advanced by another scheme has no history
@@ -201,7 +202,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
                     ratio = T(step.h[world] / step.previous_h[world])
                     first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
         if wp.static(impacts):
-            if step.impact[world] >= IMPACT_REPEATED:  # where the attempt before has found the bodies
+            if step.impact[world] >= RESTART_REPEATED:  # where the attempt before has found the bodies
                 first = (T(1.0) / T(step.dq_dv[world])) * (u[world, slot] - q)
         keep = (T(1.0) / T(step.dq_dv[world])) * (u_n[world, slot] - q)
         v[world, slot] = free_components(free[slot], first, keep)
@@ -229,7 +230,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         """
         world = wp.tid()
         if wp.static(impacts):
-            found = step.impact[world] > 0 and step.impact[world] <= RESTART_FOUND
+            found = step.impact[world] > 0 and step.impact[world] <= IMPACT_FOUND
             if found and newton.failed[world] == 0 and newton.inverted[world] == 0:
                 step.impact[world] = step.impact[world] + (IMPACT_REPEATED - IMPACT_FOUND)
                 wp.atomic_max(step.any_running, 0, 1)

@@ -86,6 +86,7 @@ def step_struct():
         world_end: wp.array(dtype=wp.float64)  # s, end of each world, if set
         new_time: wp.array(dtype=wp.float64)  # s, end of the attempt
         stage_time: wp.array(dtype=wp.float64)  # its midpoint, for midpoint schemes
+        rate_time: wp.array(dtype=wp.float64)  # s, of strain rates: dq/dv, of midpoint schemes h/2
         step_start_time: wp.array(dtype=wp.float64)  # s
         h: wp.array(dtype=wp.float64)  # s, size of the substep
         previous_h: wp.array(dtype=wp.float64)  # of schemes with a history; 0 before the first step

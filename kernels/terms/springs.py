@@ -22,7 +22,7 @@ import warp as wp
 
 from ..common.block_entries import add_block_function
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, RESTART_FOUND, pattern_struct, topology_struct
+from ..common.structs import IMPACT_FOUND, RESTART_FOUND, pattern_struct, topology_struct
 from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
 from .bounded_laws import FRICTION, STOP, bounded_functions
 from .chords import chord_functions
@@ -222,15 +222,14 @@ def spring_kernels(
 
     @masked_kernel(module, "active")
     def evaluate(
-        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, in_motion: f64, dq_dv: double_1d,
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, in_motion: f64, span: double_1d,
         active: int_1d, scr: Scratch,
     ):  # fmt: skip
-        """Forces on the vectors, their derivatives, and rows of the potential. `in_motion`: 1, or 0 in statics."""
+        """Forces on the vectors, their derivatives, and rows of the potential. `in_motion`: 1, or 0 in statics. `span`:
+        dq/dv, of a mid-point scheme h: time of the change whose rate acts on dampers."""
         world, item = wp.tid()
         kind = spr.kind[item]
-        inverse = in_motion / dq_dv[world]
-        if wp.static(midpoint):
-            inverse = f64(0.5) * inverse
+        inverse = in_motion / span[world]
         if kind == VECTOR or kind == CHORD:
             evaluate_vector(spr, u, start, inverse, world, item, scr)
             return
@@ -302,14 +301,12 @@ def spring_kernels(
     @masked_kernel(module, "active")
     def energies(
         spr: Springs, u: p.vec3_2d, start: p.vec3_2d, u_n: p.vec3_2d, law_value: vec3d_2d, in_motion: f64,
-        dq_dv: double_1d, h: double_1d, active: int_1d, scr: Scratch, rows: double_3d,
+        span: double_1d, h: double_1d, active: int_1d, scr: Scratch, rows: double_3d,
     ):  # fmt: skip
         """Stored energy at u, what viscous forces and friction take in the step from u_n, and the work of actuators."""
         world, item = wp.tid()
         sp = spr.spring[item]
-        inverse = in_motion / dq_dv[world]
-        if wp.static(midpoint):
-            inverse = f64(0.5) * inverse
+        inverse = in_motion / span[world]
         V = spr.reference[item] + vectors(spr, u, world, item)
         if wp.static(has_chords):
             if spr.kind[item] == CHORD:
@@ -353,8 +350,7 @@ def spring_kernels(
             that the stop has let go (a tenth of its rate; bounds: a tenth to all, and 0.02 to 0.1, serve as well)."""
             world, item = wp.tid()
             sp = spr.spring[item]
-            seen = impact[world] == IMPACT_FOUND or impact[world] >= IMPACT_REPEATED
-            if running[world] == 0 or failed[world] != 0 or seen or spr.law[sp] != STOP:
+            if running[world] == 0 or failed[world] != 0 or impact[world] >= IMPACT_FOUND or spr.law[sp] != STOP:
                 return
             y0 = scr.start[world, item]
             y = c.coordinate(spr.kind[item], spr.reference[item] + vectors(spr, u, world, item), y0)
@@ -364,17 +360,17 @@ def spring_kernels(
             rate, mean_rate = (y - scr.reference[world, item]) / dq_dv[world], (y - y0) / h[world]
             if scr.force[world, item] == mat33d():
                 if before != f64(0.0) and wp.abs(rate - mean_rate) > f64(0.1) * wp.abs(rate):
-                    impact[world] = RESTART_FOUND
+                    wp.atomic_max(impact, world, RESTART_FOUND)
                 return
             if before * depth <= f64(0.0):
-                impact[world] = IMPACT_FOUND
+                wp.atomic_max(impact, world, IMPACT_FOUND)
                 return
             change = k * wp.abs(depth - before)
             force_change = change + f64(2.0) * damping * wp.abs(rate - mean_rate)
             force = wp.abs(k * depth + damping * rate)
             largest = wp.max(wp.abs(depth), wp.abs(before))
             if change > f64(0.4) * k * largest or force_change > f64(0.5) * force:
-                impact[world] = RESTART_FOUND
+                wp.atomic_max(impact, world, RESTART_FOUND)
 
     @masked_kernel(module, "active")
     def store_history(

@@ -56,12 +56,12 @@ DISC = Formula("disc_height", disc_height, disc_gradients, disc_gradient_change)
 
 
 @functools.cache
-def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
+def velocity_kernels(dtype: str) -> KernelSet:
     """Kernels of the rows in one precision of the slots."""
     p = precision(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     functions, of_joint = constraint_functions(dtype), coordinate_functions(False)
-    module = kernel_module(f"velocity_rows_{dtype}{'_midpoint' if midpoint else ''}")
+    module = kernel_module(f"velocity_rows_{dtype}")
 
     @wp.func
     def coefficients(parameters: mat33d, v: mat33d) -> mat33d:
@@ -95,9 +95,10 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
     @wp.kernel(module=module)
     def evaluate(
         con: Constraints, u: p.vec3_2d, law_value: vec3d_2d, alpha: double_1d, active: int_1d,
-        mul: Multipliers, u_tilde: p.vec3_2d, u_n: p.vec3_2d, dq_dv: double_1d, frozen: int_1d,
+        mul: Multipliers, u_tilde: p.vec3_2d, u_n: p.vec3_2d, span: double_1d, frozen: int_1d,
     ):  # fmt: skip
-        """c at u with the A in the multipliers. The target of a drive is its motion so far."""
+        """c at u with the A in the multipliers. `span`: dq/dv, of a mid-point scheme h. The target of a drive is its
+        motion so far."""
         world, row = wp.tid()
         if active[world] == 0 or con.kind[row] != VELOCITY:
             return
@@ -108,10 +109,7 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
             end = functions.term_vector(con, term, u, world)
             c += wp.dot(A, end - functions.term_vector(con, term, u_tilde, world))
             moved += wp.dot(A, end - functions.term_vector(con, term, u_n, world))
-        span = dq_dv[world]
-        if wp.static(midpoint):
-            span = f64(2.0) * span
-        c -= con.scale[row] * span * functions.right_side(con, law_value, world, row)
+        c -= con.scale[row] * span[world] * functions.right_side(con, law_value, world, row)
         target = f64(0.0)
         if con.law[row] >= 0:
             target = moved / con.scale[row]

@@ -183,12 +183,10 @@ class ConstraintTables:
         """Row kind and kernels of each formula."""
         return [(k, formula_kernels(self.model.dtype, midpoint, f)) for k, f in enumerate(self.formulas, FORMULA)]
 
-    def update_velocity_rows(
-        self, launch: Launcher, midpoint: bool, u_stage: wp.array, active: wp.array, multipliers: Any
-    ) -> None:  # fmt: skip
+    def update_velocity_rows(self, launch: Launcher, u_stage: wp.array, active: wp.array, multipliers: Any) -> None:
         """A of the rows at the level of velocities, at u_stage."""
         args = [self.data, self.velocity_parameters, u_stage, active, multipliers]
-        launch(velocity_kernels(self.model.dtype, midpoint).update, (self.model.worlds, self.count), args)
+        launch(velocity_kernels(self.model.dtype).update, (self.model.worlds, self.count), args)
 
     def _upload_row_pairs(self) -> None:
         """Pairs of shared vectors for each pair of rows that share slots: dense within clusters, else couplings."""

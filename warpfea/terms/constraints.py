@@ -167,9 +167,9 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         w, k = ctx.work, self.integrator_kernels(ctx)
         ctx.launch(k.reset_violation, w.multipliers.violation.shape, [active, w.multipliers])
         args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.search.alpha, active, w.multipliers]
-        start = ctx.state.displacement if ctx.midpoint else w.q_tilde
+        start, span = (ctx.state.displacement, w.step.h) if ctx.midpoint else (w.q_tilde, w.step.dq_dv)
         more = [w.time_law_stage_values, w.newton.search.alpha, active, w.multipliers]
-        more += [start, ctx.state.displacement, w.step.dq_dv, w.newton.frozen.contact_active]
+        more += [start, ctx.state.displacement, span, w.newton.frozen.contact_active]
         self._evaluate_rows(ctx.launch, ctx.midpoint, args, more)
 
     def _evaluate_rows(self, launch: Launcher, midpoint: bool, args: list[Any], more: list[Any]) -> None:
@@ -177,8 +177,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         for kind, kernels in self.tables.formula_kernels(midpoint):
             launch(kernels.evaluate, self.dim, [kind, *args])
         if self.tables.has_velocity_rows:
-            kernel = velocity_kernels(self.model.dtype, midpoint).evaluate
-            launch(kernel, self.dim, [*args[:2], *more])
+            launch(velocity_kernels(self.model.dtype).evaluate, self.dim, [*args[:2], *more])
 
     prepare = force  # J, for rho
 
@@ -364,7 +363,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         mul.last_target.fill_(np.nan)  # any number of turns is valid
         u, zero = state.displacement, zeros((B,), wp.float64)
         if con.has_velocity_rows:  # at rest
-            con.update_velocity_rows(launch, False, u, all_worlds, mul)
+            con.update_velocity_rows(launch, u, all_worlds, mul)
         rest = [value, zero, all_worlds, mul]
         self._evaluate_rows(launch, False, [con.data, u, u, *rest], [*rest, u, u, zero, zeros((B,), wp.int32)])
         return mul

@@ -115,7 +115,7 @@ class Elements(Differentiable):
     def diagonal(self, ctx: StepContext, active: wp.array) -> None:
         m, w = self.model, ctx.work
         for block, kernels in zip(m.blocks, self.kernels(ctx)):
-            args = [w.data_of(block), w.u_stage, w.step.dq_dv, active, w.block_contribution]
+            args = [w.data_of(block), w.u_stage, w.step.rate_time, active, w.block_contribution]
             ctx.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)
 
     def matrices(self, state: State, world: int) -> tuple[Congruence, None]:

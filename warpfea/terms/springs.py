@@ -265,9 +265,10 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
         ctx.launch(self.kernels(ctx).begin, self.dim, args)
 
     def start_of_step(self, ctx: StepContext) -> tuple[wp.array, list[Any]]:
-        """Positions from which a VECTOR has its rate; values of time laws, 0 in statics, and dq/dv."""
-        start, w = ctx.state.displacement if ctx.midpoint else ctx.work.q_tilde, ctx.work
-        return start, [w.time_law_stage_values, float(ctx.inertia), w.step.dq_dv]
+        """Positions from which a VECTOR has its rate; values of time laws, 0 in statics, and the time of rates, s."""
+        w = ctx.work
+        start, span = (ctx.state.displacement, w.step.h) if ctx.midpoint else (w.q_tilde, w.step.dq_dv)
+        return start, [w.time_law_stage_values, float(ctx.inertia), span]
 
     @part("springs")
     def force(self, ctx: StepContext, active: wp.array) -> None:

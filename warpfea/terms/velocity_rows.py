@@ -57,13 +57,13 @@ class VelocityRows(Updated, Tied):
         raise ModelError(f"{self._first}: statics has no velocities; leave it out, or take a constraint of positions")
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        return {velocity_kernels(self.model.dtype, ctx.midpoint).update.module}
+        return {velocity_kernels(self.model.dtype).update.module}
 
     @part("constraints")
     def prepare(self, ctx: StepContext, active: wp.array) -> None:
         tables, w = self.model.constraints, ctx.work
         assert tables is not None
-        tables.update_velocity_rows(ctx.launch, ctx.midpoint, w.u_stage, active, w.multipliers)
+        tables.update_velocity_rows(ctx.launch, w.u_stage, active, w.multipliers)
 
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         self.prepare(ctx, flags)

@@ -163,9 +163,11 @@ class Workspace:
             "impact",
         )
         unused += ("energy_growth", "min_energy")
-        unused += () if midpoint else ("stage_time",)
+        unused += () if midpoint else ("stage_time", "rate_time")
         self.step = self.struct(step_struct(), B, skip=unused, run_end=(2,))
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time
+        if not midpoint:
+            self.step.rate_time = self.step.dq_dv
         # contact evaluates gaps in double precision, of positions
         farthest = max(float(np.abs(body.mesh.bounding_box()).max()) for body in model.bodies)
         self.gap_displacement = farthest * float(np.finfo(np.float64).eps / np.finfo(model.dtype).eps)
@@ -173,7 +175,7 @@ class Workspace:
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
-        self.stage = self.iterate(self.u_stage, self.v_stage, self.step.dq_dv)
+        self.stage = self.iterate(self.u_stage, self.v_stage, self.step.rate_time)
 
     def _with_own_weights(self, data: Any) -> Any:
         """Copy of the constants of a block of rigid parts whose weights change with the step."""
