@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, RESTART_FOUND, RESTART_REPEATED, free_components_function
+from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, RESTART_REPEATED, free_components_function
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_2d, f64, int_1d, precision
 from ..solvers.newton_control import Failure, control_struct
