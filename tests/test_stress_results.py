@@ -4,7 +4,7 @@
     warpfea stress --device cuda:0 --json tests/results/stress_h200.json
     warpfea stress --case first-scenes --device cpu --json tests/results/first_scenes_cpu.json
     warpfea stress --case motors --device cpu --json tests/results/motors_cpu.json
-    warpfea stress --case mounts --device cpu --json tests/results/mounts_cpu.json
+    warpfea stress --case mounts --device cpu --json tests/results/mounts_cpu.json  (both with cuda:0 too)
 
 The table of the H200 was made case by case, in parallel processes on one GPU, and joined; `unfinished` there names the
 cases that were stopped.
@@ -18,13 +18,12 @@ from warpfea.studies.stress.suite import load_cases, select_rows
 
 FILES = {
     "stress_cpu.json": "cpu", "stress_h200.json": "cuda:0", "first_scenes_cpu.json": "cpu", "motors_cpu.json": "cpu",
-    "mounts_cpu.json": "cpu",
+    "mounts_cpu.json": "cpu", "motors_h200.json": "cuda:0", "mounts_h200.json": "cuda:0",
 }  # fmt: skip
 MOTORS = ("pd", "stop-speed", "friction-ratio", "held-chain", "speed")
 MOUNTS = ("bushing", "fallen-part", "tube", "wheel", "fallen-roller", "knife")
-OWN_FILES = {"first-scenes": "first_scenes_cpu.json"} | dict.fromkeys(MOTORS, "motors_cpu.json")
-OWN_FILES |= dict.fromkeys(MOUNTS, "mounts_cpu.json")
-"""Cases whose rows, of minutes each or not yet run on the H200, are in files of their own."""
+OWN_FILES = {"first-scenes": "first_scenes"} | dict.fromkeys(MOTORS, "motors") | dict.fromkeys(MOUNTS, "mounts")
+"""Cases whose rows are in files of their own, by how these begin."""
 STOPPED = {"rest-1e6", "first-scenes/ball-shell-5mm-drop-0.5-2e+11-0.001-energy_momentum"}
 """Rows and cases that were stopped; that of first scenes after 470 s."""
 SPEED = {"hard_steps_h200.json": ("--peer", 1.05, 13), "hard_steps_cpu.json": ("--cpu", 1.10, 12)}
