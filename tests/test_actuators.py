@@ -145,7 +145,8 @@ def test_a_damped_stop_hit_at_10_m_per_s(scheme: str, h: float) -> None:
                        np.abs(losses).max()])  # fmt: skip
     ratios = np.array(errors[0]) / errors[1]
     assert ratios.min() > (1.8 if scheme == "backward_euler" else 3.5), errors
-    assert errors[1] < ([0.25, 8e-3, 3.0] if scheme == "backward_euler" else [3e-3, 1e-4, 0.05]), errors
+    bounds = [0.25, 8e-3, 3.0] if scheme == "backward_euler" else [3e-3, 1e-4, 0.05]
+    assert (np.array(errors[1]) < bounds).all(), errors
     if scheme == "bdf2":
         sim = wf.Simulation(b.finalize(device="cpu"), dt="auto", error=1e-4, integrator=scheme, **TIGHT)
         sim.model.set_parameter("slide.upper", ends[:1])
@@ -168,7 +169,7 @@ def test_stops_by_default_take_most_of_the_speed() -> None:
 def test_stops_never_throw_back() -> None:
     """A critically damped stop returns e^-2 of the speed; steps that do not resolve it return less, and none is refused
     or books a negative loss, wherever in a step the stop is met."""
-    for h, least in ((2e-4, 0.13), (2e-3, 0.0), (1e-2, 0.0)):
+    for h, least, most in ((2e-4, 0.13, np.exp(-2.0)), (1e-3, 0.08, 0.1), (2e-3, 0.05, 0.08), (1e-2, 0.0, 0.015)):
         for speed in (8.7, 9.4, 10.0, 10.6):
             b, slide = slider(speed, limits=(-10.0, 1.0))
             sim = run(b, h, "bdf2")
@@ -176,7 +177,7 @@ def test_stops_never_throw_back() -> None:
             for _ in range(round(1.0 / speed / h) + max(4, round(6e-3 / h))):
                 sim.step()
                 losses.append(sim.energies()["spring_loss"][0])
-            assert least < -sim.joint_rate(slide)[0] / speed < np.exp(-2.0), (h, speed)
+            assert least < -sim.joint_rate(slide)[0] / speed < most, (h, speed)
             assert min(np.diff(losses)) >= 0.0, (h, speed)
             assert losses[-1] < speed**2
 

@@ -183,6 +183,20 @@ def test_springs_and_dampers(kind):
     assert found.damping_ratios[mode] == pytest.approx(2.0 / (2.0 * np.sqrt(k / mass)), rel=1e-5)
 
 
+def test_springs_side_by_side_are_as_one():
+    """Also four, whose vectors have 36 components, as many as the beam."""
+    found = []
+    for count in (2, 4):
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        law, section = wf.SVK(E=E, nu=0.0, density=1e3), wf.Rectangle(0.02, 0.02)
+        beam = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=2, section=section, normal=(0, 0, 1), material=law)
+        b.clamp(beam.start, slots="all")
+        for _ in range(count):
+            b.add_spring(beam.end, (1, 0, 1), stiffness=1e3 / count)
+        found.append(wf.modes(b.finalize(device="cpu"), count=3).frequencies)
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
+
+
 def test_a_small_part_far_from_its_joint_and_springs():
     """1 kg of 1e-14 kg m^2, 0.5 m from a joint with a stiffness, from a ball joint that a spring holds about one axis,
     and from a bushing: sqrt(c/(m l^2)); round-off of the weights of points was 1e-2 of it, and 0 Hz was told."""

@@ -120,6 +120,20 @@ def test_the_scene_of_a_top_turns_as_its_equation_says() -> None:
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
 
 
+def test_steps_in_flight_that_round_off_ends_say_so() -> None:
+    """Of a slow spin forces are below the round-off of positions: what is left of them changes no position."""
+    b, part = box()
+    b.set_initial(part, velocity=(1.0, 0.0, 0.0), angular_velocity=(1e-3, 2e-3, 1e-3))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, integrator="bdf2")
+    reports = [sim.step() for _ in range(20)]
+    beyond = [r for r in reports if r.residual[0] > 1e-8]
+    assert len(beyond) > 10
+    floors = [r.floor[0] for r in beyond]
+    assert 0.0 < min(floors) < 1e-15
+    assert max(floors) < 1e-4
+    assert sum(int(r.newton[0]) for r in reports) < 60
+
+
 SPIN_LOSSES = {"backward_euler": 1e-2, "bdf2": 0.5e-4, "generalized_alpha": 0.3e-4}
 """Share of the rate that a step of 0.1 rad loses."""
 

@@ -294,6 +294,17 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         return ctl.floor.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[Row.KINETIC, world]
 
     @wp.func
+    def is_far_below_rounding(ctl: Control, world: int) -> bool:
+        """True in motion with constraints if the residual is a thousandth of a rounding of the positions, which moves none;
+        sets the error, relative to positions, in the D norm."""
+        if wp.static(traits.has_constraints and not traits.unilateral):
+            ratio = ctl.floor.rounding_ratio[world]
+            if f64(STALL_ROUNDINGS) * ratio <= f64(1.0) and ctl.iterations[world] > 0 and ctl.is_static == 0:
+                ctl.floor.error[world] = wp.max(ctl.floor.error[world], f64(2.0) * ctl.floor.eps * ratio)
+                return True
+        return False
+
+    @wp.func
     def check_convergence(ctl: Control, world: int):
         """End the iteration if it has converged or used up its iterations; if it stalls within round-off, request an
         error estimate."""
@@ -320,9 +331,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         still = ctl.norms.residual_reduction[world] > f64(STALL_RATIO) and ctl.solve.operator_reused[world] == 0
         done = ctl.norms.ratio[world] <= f64(1.0)
-        if wp.static(traits.has_constraints and not traits.unilateral):  # a thousandth of a rounding moves no position
-            fixed = f64(STALL_ROUNDINGS) * ctl.floor.rounding_ratio[world] <= f64(1.0)
-            done = done or (fixed and ctl.iterations[world] > 0 and ctl.is_static == 0)
+        if not done:
+            done = is_far_below_rounding(ctl, world)
         if done:
             accept_iterate(ctl, world)
         elif near and ctl.iterations[world] > 0 and still and settling:

@@ -270,9 +270,9 @@ def buckling(model: Model, state: State, *, count: int = 1, world: int = 0) -> B
     system = _linearise("buckling", model, start, count, world)
     G = system.K - loaded.K
     at_rest, at_load = (model.evaluation.tangent_matrix(at, world) for at in (start, state))
-    G = G + system.restrict(
-        at_load - at_rest - model.evaluation.stress_stiffness(state, world)
-    )  # the turn would soften
+    # the difference has the turn of the elements to first order alone, which softens
+    change = at_load - at_rest - model.evaluation.stress_stiffness(state, world)
+    G = G + system.restrict(change)
     if len(system.index) <= MAX_DENSE:
         Z = system.null_space()
         try:

@@ -126,7 +126,7 @@ class Elements(Differentiable):
             if body.rigid:
                 flexible[body.slot_range] = 0.0
         W = sp.diags(flexible.ravel(), format="csr")
-        return Congruence(W, self.model.evaluation.tangent_matrix(state, world)), None
+        return Congruence(W, self.model.evaluation.tangent_matrix(state, world), diagonal=True), None
 
     # adjoint
 

@@ -127,27 +127,25 @@ class FieldSpec:
 @dataclass(frozen=True, eq=False)
 class Congruence:
     """W^T H W, not multiplied out: round-off of the product hides it where weights W, (n, 3 slots), of points far from
-    a small rigid part are large. H: (n, n). A diagonal W of 1 and 0 leaves out what constraints hold."""
+    a small rigid part are large. H: (n, n). A `diagonal` W of 1 and 0 leaves out what constraints hold."""
 
     W: sp.csr_matrix
     H: sp.csr_matrix
+    diagonal: bool = False
 
     @classmethod
     def parts_of(cls, matrix: Any) -> list[Congruence]:
         """A matrix, of one part, or none."""
         if matrix is None:
             return []
-        return [matrix] if isinstance(matrix, cls) else [cls(sp.identity(len(matrix.indptr) - 1, format="csr"), matrix)]
+        if isinstance(matrix, cls):
+            return [matrix]
+        return [cls(sp.identity(len(matrix.indptr) - 1, format="csr"), matrix, diagonal=True)]
 
     def restrict(self, index: np.ndarray) -> Congruence:
         """On some components."""
         W = self.W[:, index]
-        return Congruence(W[index], self.H[index][:, index]) if self.is_diagonal else Congruence(W, self.H)
-
-    @property
-    def is_diagonal(self) -> bool:
-        """True where H is of the components themselves."""
-        return bool(self.W.shape[0] == self.W.shape[1])
+        return Congruence(W[index], self.H[index][:, index], True) if self.diagonal else Congruence(W, self.H)
 
     def project(self, Z: np.ndarray) -> np.ndarray:
         """Z^T W^T H W Z."""
@@ -156,7 +154,7 @@ class Congruence:
 
     def product(self) -> sp.csr_matrix:
         """W^T H W, of a diagonal W H."""
-        return self.H if self.is_diagonal else self.W.T @ self.H @ self.W
+        return self.H if self.diagonal else self.W.T @ self.H @ self.W
 
     def size(self) -> np.ndarray:
         """Its diagonal, of weights of at most 1."""
