@@ -105,7 +105,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             step.any_running[0] = 0
             step.any_rejected[0] = 0
         if wp.static(impacts):
-            if step.accepted[world] != 0 or step.rejected[world] != 0:
+            # worlds that wait for others keep theirs, which says how their step was taken
+            if step.running[world] != 0 and (step.accepted[world] != 0 or step.rejected[world] != 0):
                 step.impact[world] = 0
         step.accepted[world] = 0
         step.first_rejection[world] = 0

@@ -279,8 +279,7 @@ class Adjoint(Tape):
         self._graph = self._graph or self._capture(sums)
         wp.capture_launch(self._graph)
         if part in self.restarts:
-            h = float(np.max(self.sim.dt))
-            step_back_to_initial(self.stepper, self.at, self.restarts[part], h, self._gradients, sums)
+            step_back_to_initial(self.stepper, self.at, self.restarts[part], self._gradients, sums)
 
     def _capture(self, sums: dict[str, wp.array]) -> wp.Graph:
         """Graph of one step back, from the state at its start."""

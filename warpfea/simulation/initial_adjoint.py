@@ -130,9 +130,9 @@ class InitialSolves:
         rows: bars of the rows by world. h: size of the step, s.
     """
 
-    def __init__(self, stepper: Stepper, at: StepAdjoint, restart: tuple[np.ndarray, np.ndarray], h: float) -> None:
-        self.flags, self.before = restart
-        self.chosen, self.h = np.flatnonzero(self.flags).tolist(), h
+    def __init__(self, stepper: Stepper, at: StepAdjoint, restart: tuple[np.ndarray, np.ndarray, float]) -> None:
+        self.flags, self.before, self.h = restart
+        self.chosen = np.flatnonzero(self.flags).tolist()
         self.stepper, self.at, self.model = stepper, at, stepper.model
         assert stepper.initial_conditions is not None
         self.start = stepper.initial_conditions
@@ -140,7 +140,7 @@ class InitialSolves:
         state: Any = stepper.state
         self.u, self.acceleration = state.displacement.numpy().copy(), state.acceleration.numpy().copy()
         self.first, self.jerk, self.first_bars, self.jerk_bars = (np.zeros_like(self.u) for _ in range(4))
-        self.laws = self.start.law_derivatives(self.flags, h)
+        self.laws = self.start.law_derivatives(self.flags, self.h)
         self.corrected = self.before.copy()
         self.multipliers: dict[int, tuple[Any, Any]] = {}
         self.rows: dict[int, RowsOfWorld] = {}
@@ -223,18 +223,18 @@ class InitialSolves:
 
 
 def step_back_to_initial(
-    stepper: Stepper, at: StepAdjoint, restart: tuple[np.ndarray, np.ndarray], h: float, gradients: Any,
+    stepper: Stepper, at: StepAdjoint, restart: tuple[np.ndarray, np.ndarray, float], gradients: Any,
     sums: Mapping[str, wp.array],
 ) -> None:  # fmt: skip
     """Pass the bars of accelerations in the flagged worlds to those of the state before, and of parameters.
 
     Args:
-        stepper: has the state with these accelerations; h: the size of its step, s.
-        restart: flags (worlds,), and velocities before (worlds, slots, 3).
+        stepper: has the state with these accelerations.
+        restart: flags (worlds,), velocities before (worlds, slots, 3), and the size of the step, s.
         gradients: functions of the parameters with their sums; sums: by name.
     """
     solver, flags = at.solver, restart[0]
-    solves = InitialSolves(stepper, at, restart, h)
+    solves = InitialSolves(stepper, at, restart)
     bars = [solver.bars[name] for name in stepper.integrator.history_arrays]
     a_bar, w_bar = (bar.numpy().copy() for bar in bars)
     v_bar = solver.v_bar.numpy().copy()
@@ -247,7 +247,7 @@ def step_back_to_initial(
     for array, values in ((solver.q_bar, q_bar), (solver.v_bar, v_bar)):
         set_rows(array, flags, values[flags])
     pairs = ((solves.first, solves.first_bars), (solves.jerk, solves.jerk_bars))
-    _add_inertia(stepper, at, flags, h, gradients, pairs)
+    _add_inertia(stepper, at, flags, solves.h, gradients, pairs)
     _add_targets(stepper.model, solves.rows, sums)
 
 

@@ -64,8 +64,8 @@ class Tape:
         kept: arrays of the state at the start and after each part of a step, and for the part that begins there its
             controls, the size "dt" in each world, and the "status", running in worlds that take part.
         ends: index in `kept` of the end of each step.
-        restarts: by index in `kept`, flags (worlds,) of worlds whose initial accelerations are those of its state, and
-            the velocities (worlds, slots, 3) before.
+        restarts: by index in `kept`, flags (worlds,) of worlds whose initial accelerations are those of its state, the
+            velocities (worlds, slots, 3) before, and the step, s, that they were found for.
     """
 
     static = False
@@ -144,7 +144,7 @@ class Tape:
             flags = initial.prepare(self.sim.dt)
             if flags.any():
                 self.kept[-1] = self._snapshot()
-                self.restarts[len(self.kept) - 1] = flags, before
+                self.restarts[len(self.kept) - 1] = flags, before, self.sim.dt
 
     def _add_part(self, chosen: np.ndarray, controls: dict[str, wp.array]) -> None:
         """Add a part of a step that the chosen worlds have taken."""
@@ -181,7 +181,7 @@ class Tape:
         """Forget the steps kept."""
         self.kept = KeptStates(self.sim, self._kept_names(), self.budget, self.folder)
         self.ends: list[int] = []
-        self.restarts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.restarts: dict[int, tuple[np.ndarray, np.ndarray, float]] = {}
         self._probe_values: dict[str, list[ProbeArrays]] = {}
         self.probes.clear()
 
