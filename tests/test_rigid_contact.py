@@ -157,3 +157,19 @@ def test_dampers_in_steps_that_impacts_set_to_backward_euler():
         assert sim.joint_value(slide)[0] == pytest.approx(2 - 2 * np.exp(-0.2), rel=1e-3)
         swings.append(sim.displacements(cube)[0])
     assert np.abs(swings[1] - swings[0]).max() < 0.01 * np.abs(swings[0]).max()
+
+
+def test_a_drive_in_steps_that_impacts_set_to_backward_euler():
+    """A wheel has the speed of its drive while a ball stops on the floor."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    ball = b.add_rigid(wf.Sphere((0, 0, 0.0613), 0.05), mass=1.0)
+    b.add_contact(ball, b.add_collider(wf.HalfSpace(normal=(0, 0, 1))))
+    b.set_initial(ball, velocity=(0, 0, -10.0))
+    wheel = b.add_rigid(wf.Cylinder((5, 0, 1), (5, 0.1, 1), 0.2), mass=1.0)
+    hinge = b.add_joint("revolute", parent=wf.GROUND, child=wheel.at((5, 0, 1)), axis=(0, 1, 0))
+    b.add_velocity_constraint("speed", hinge, value=3.0)
+    b.set_initial(wheel, angular_velocity=(0, 3.0, 0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator="energy_momentum", constraint_tol=1e-12)
+    sim.step(6)
+    assert sim.joint_value(hinge)[0] == pytest.approx(0.018, rel=1e-5)
+    assert sim.energies()["integrator"][0] > 10.0

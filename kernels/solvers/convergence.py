@@ -295,8 +295,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
 
     @wp.func
     def is_far_below_rounding(ctl: Control, world: int) -> bool:
-        """True in motion with constraints if the residual is a thousandth of a rounding of the positions, which moves none;
-        sets the error, relative to positions, in the D norm."""
+        """True in motion with constraints if the residual is a thousandth of a rounding of the positions, which moves
+        none; sets the error, relative to positions, in the D norm."""
         if wp.static(traits.has_constraints and not traits.unilateral):
             ratio = ctl.floor.rounding_ratio[world]
             if f64(STALL_ROUNDINGS) * ratio <= f64(1.0) and ctl.iterations[world] > 0 and ctl.is_static == 0:

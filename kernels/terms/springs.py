@@ -346,8 +346,8 @@ def spring_kernels(
             impact: int_1d,
         ):  # fmt: skip
             """Flag worlds whose converged attempt hits a stop, or, to restart, does not resolve its force: in the step
-            after a hit, where the force changes by half, and where what the scheme remembers of it throws back a body
-            that the stop has let go (a tenth of its rate; bounds: a tenth to all, and 0.02 to 0.1, serve as well)."""
+            after a hit, where the force changes by half, and where what the scheme remembers of it changes the rate of
+            a body that the stop has let go by a tenth. Shares of 0.1 to 1, and of 0.02 to 0.1, serve as well."""
             world, item = wp.tid()
             sp = spr.spring[item]
             if running[world] == 0 or failed[world] != 0 or impact[world] >= IMPACT_FOUND or spr.law[sp] != STOP:

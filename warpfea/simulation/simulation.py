@@ -82,7 +82,7 @@ class Simulation:
         plan: methods for what the options leave open, `plan` of another simulation: a world alone then has the bits
             that it has among others. None: chosen for the model, see `ModelBuilder.finalize(many=)`.
         constraint_tol: largest constraint violation, over the model's size (`model.size`); by default 1e-8 in float64,
-            1e-5 in float32.
+            1e-5 in float32, where violations within the round-off of positions, at most 2e-3 of the size, pass too.
         ledger: compute the energy ledger.
         record: store probe, joint and contact results of every step, else of the last only.
         capture: capture a step as one graph, on the GPU and on the CPU; never with linear="direct".
