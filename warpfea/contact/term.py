@@ -15,9 +15,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import PenetrationError
-from ..base.launch import Launcher
 from ..kernels.contact.assembly import AITKEN_LANES, block_kernels, contact_kernels
-from ..kernels.contact.double_displacements import double_displacement_kernels
 from ..kernels.contact.ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledger_kernels
 from ..kernels.contact.structs import (
     PENETRATION_ROW,
@@ -32,6 +30,7 @@ from ..model.state import State
 from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Touching, Updated
 from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .collider_tables import facet_pattern_entries
+from .double_displacements import DoubleDisplacements
 from .evaluation import CONTACT_FIELDS, reference_position_text
 from .tables import POINT_SUM_LANES, speed_damping
 
@@ -427,30 +426,3 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     def _contact_info(self, contact: Any, k: int) -> dict[str, Any]:
         """Further numbers."""
         raise NotImplementedError
-
-
-class DoubleDisplacements:
-    """Displacements of the contact slots in float64, for a float32 model; see
-    kernels/contact/double_displacements.py.
-
-    Attributes:
-        kernels: device code.
-    """
-
-    def __init__(self, model: Model, connectivity: list[np.ndarray]) -> None:
-        self.kernels = double_displacement_kernels()
-        slots = np.unique(np.concatenate([conn.ravel() for conn in connectivity]))
-        self._slots = model.array("contact", slots, wp.int32)
-
-    def update(self, ctx: StepContext, out: wp.array, active: wp.array) -> None:
-        """Displacements of the iterate; in statics (no velocities) those of the state, rounded."""
-        w = ctx.work
-        if not ctx.inertia:
-            self.widen(ctx.launch, w.u, active, out)
-            return
-        args = [self._slots, w.q_tilde, w.v, w.step.dq_dv, active, out]
-        ctx.launch(self.kernels.update_displacements, (len(out), len(self._slots)), args)
-
-    def widen(self, launch: Launcher, u: wp.array, active: wp.array, out: wp.array) -> None:
-        """Copy u in float64."""
-        launch(self.kernels.copy_to_float64, (len(out), len(self._slots)), [self._slots, u, active, out])

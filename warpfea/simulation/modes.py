@@ -3,20 +3,19 @@
 K phi = omega^2 M phi on the free components with J phi = 0. K is the tangent of the elements at the state (with its
 prestress) plus those of springs and of joint forces, sum lambda d2c/dq2. Large models: Lanczos' method on the inverse
 of K - sigma M bordered by J; small ones: a basis of J's null space. Multipliers of redundant rows stay bounded by
-COMPLIANCE on the diagonal.
+COMPLIANCE of linear_system.py on the diagonal.
 """
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from ..base.checks import check_positive, is_number
 from ..base.errors import ModelError
@@ -24,10 +23,8 @@ from ..base.lazy import require_matplotlib
 from ..base.writer import aborted_on_error, writer_for
 from ..model.assembly import require_density
 from ..model.state import State
-from ..terms.checks import overrides
-from ..terms.protocols import Touching
-from ..terms.term import Congruence, Term
-from .checks import check_model, check_state
+from .checks import check_model
+from .linear_system import LinearSystem, linearise
 from .results import Results
 
 if TYPE_CHECKING:
@@ -36,9 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Buckling", "Modes", "buckling", "modes"]
 
-COMPLIANCE = 1e-11
-"""Compliance of joints over that of the elements: an error of frequencies of this size. A bound: any value between
-round-off and the accuracy wanted does."""
 MAX_DENSE = 400
 """Number of unknowns up to which all eigenvalues are computed."""
 RELATIVE_SHIFT = 1e-8
@@ -231,7 +225,7 @@ def modes(
     if shift is not None and not (is_number(shift) and shift >= 0.0):
         raise ModelError(f"modes: shift = {shift!r} must be a frequency, Hz, 0 or more")
     state = model.state() if state is None else state
-    system = _linearise("modes", model, state, count, world)
+    system = linearise("modes", model, state, count, world)
     M = system.restrict(model.mass_matrix(world))
     values, vectors = _vibrations(system, M, count, None if shift is None else (2.0 * np.pi * shift) ** 2)
     phi = system.expand(vectors)
@@ -264,10 +258,10 @@ def buckling(model: Model, state: State, *, count: int = 1, world: int = 0) -> B
         ModelError: as `modes`; a model that is not held; no buckling under this load, or fewer modes than asked.
     """
     check_model(model)
-    loaded = _linearise("buckling", model, state, count, world)
+    loaded = linearise("buckling", model, state, count, world)
     start = model.state()
     start.displacement.zero_()
-    system = _linearise("buckling", model, start, count, world)
+    system = linearise("buckling", model, start, count, world)
     G = system.K - loaded.K
     at_rest, at_load = (model.evaluation.tangent_matrix(at, world) for at in (start, state))
     # the difference has the turn of the elements to first order alone, which softens
@@ -293,99 +287,6 @@ def buckling(model: Model, state: State, *, count: int = 1, world: int = 0) -> B
     if found < count:
         raise ModelError(f"buckling: {found} modes under this load, {count} asked: does it compress anything?")
     return Buckling(model, state, system.expand(vectors[:, best]), 1.0 / mu[best])
-
-
-@dataclass(frozen=True, eq=False)
-class LinearSystem:
-    """A model linearised at a state, on the free components.
-
-    Attributes:
-        model: the model. index: free components.
-        parts: of the stiffness. J: constraint gradients, rows of length 1. C: parts of damping, on all components.
-    """
-
-    model: Model
-    index: np.ndarray
-    parts: list[Congruence]
-    J: sp.csr_matrix
-    C: list[Congruence]
-
-    @cached_property
-    def K(self) -> sp.csr_matrix:
-        """The stiffness, with that of rigid parts."""
-        K = sum((part.product() for part in self.parts), sp.csr_matrix((len(self.index),) * 2))
-        return 0.5 * (K + K.T).tocsr()
-
-    def project(self, Z: np.ndarray) -> np.ndarray:
-        """Z^T K Z of motions that the constraints allow."""
-        out = sum((part.project(Z) for part in self.parts), np.zeros((Z.shape[1],) * 2))
-        return 0.5 * (out + out.T)
-
-    def restrict(self, matrix: sp.csr_matrix) -> sp.csr_matrix:
-        """Rows and columns of the free components."""
-        return matrix[self.index][:, self.index]
-
-    def expand(self, vectors: np.ndarray) -> np.ndarray:
-        """(count, slots, 3) from columns (free, count)."""
-        out = np.zeros((vectors.shape[1], 3 * self.model.slots))
-        out[:, self.index] = vectors.T
-        return out.reshape(len(out), -1, 3)
-
-    def null_space(self) -> np.ndarray:
-        """Orthonormal basis (free, n) of the motions that the constraints allow."""
-        if not self.J.shape[0]:
-            return np.eye(len(self.index))
-        return scipy.linalg.null_space(self.J.toarray(), rcond=1e-9)
-
-    def inverse(self, A: sp.csr_matrix) -> LinearOperator:
-        """x of A x + J^T y = b, J x = 0."""
-        scale = float(np.median(np.abs(A.diagonal())))
-        n, rows = len(self.index), self.J.shape[0]
-        border = scale * self.J
-        corner = -COMPLIANCE * scale * sp.identity(rows)
-        bordered = sp.bmat([[A, border.T], [border, corner]]) if rows else A
-        try:
-            factor = splu(bordered.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01)
-        except RuntimeError as error:
-            raise ModelError(f"the stiffness is singular ({error}): hold the model, or give another shift") from error
-        zero = np.zeros(rows)
-        return LinearOperator((n, n), matvec=lambda b: factor.solve(np.append(b, zero))[:n], dtype=float)
-
-
-def _linearise(what: str, model: Model, state: State, count: int, world: int) -> LinearSystem:
-    """The model at a state. ModelError as `modes`."""
-    check_state(model, state)
-    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
-        raise ModelError(f"{what}: count = {count!r} must be a positive whole number")
-    if isinstance(world, bool) or not isinstance(world, (int, np.integer)) or not 0 <= world < model.worlds:
-        raise ModelError(f"{what}: world = {world!r} must be a number from 0 to {model.worlds - 1}")
-    if model.dtype != "float64":
-        raise ModelError(f"{what}: float32 can't resolve the stiffness; take finalize(dtype='float64')")
-    if not np.isfinite(state.displacement.numpy()[world]).all():
-        raise ModelError(f"{what}: positions of world {world} are not finite in this state")
-    index = np.flatnonzero(model.free_slots.ravel())
-    if not len(index):
-        raise ModelError(f"{what}: every component of every node is prescribed")
-    found: tuple[list[Congruence], list[Congruence]] = [], []
-    for term in model.terms:
-        if isinstance(term, Touching):
-            if term.nodal_force(state)[world].any():
-                names = ", ".join(repr(contact.name) for contact in term.tables.contacts)
-                raise ModelError(f"{what}: contact is active in this state ({names}); take a state without contact")
-            continue
-        if not overrides(term, Term.matrices):
-            raise ModelError(
-                f"{what}: the stiffness of {term.name!r} is not known (pressure, moments, force fields and terms of "
-                "your own depend on the motion); build the model without, and give the loaded state"
-            )
-        for parts, matrix in zip(found, term.matrices(state, world)):
-            parts += Congruence.parts_of(matrix)
-    J = sp.csr_matrix((0, len(index)))
-    if model.constraints is not None:
-        J = model.evaluation.constraint_jacobian(state, world)[:, index]
-        size = np.sqrt(np.asarray(J.multiply(J).sum(axis=1)).ravel())
-        J = (sp.diags(1.0 / np.where(size > 0.0, size, 1.0)) @ J)[size > 0.0]
-    return LinearSystem(model, index, [part.restrict(index) for part in found[0]], J.tocsr(), found[1])
 
 
 def _vibrations(
