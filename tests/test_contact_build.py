@@ -168,6 +168,8 @@ BAD = {
     "other builder's": (on(lambda b, s, f: (s, start()[2])), r"collider 'floor' belongs to another builder"),
     "other body": (on(lambda b, s, f: (start()[1], f)), r"body 'block' belongs to another builder"),
     "no body": (on(lambda b, s, f: (f, s)), r"add_contact: expected a handle of a body"),
+    "name of a body": (on(lambda b, s, f: ("block", f)), r"got 'block'; the handle of this body is what add_solid"),
+    "name of a set": (on(lambda b, s, f: ("z-", f)), r"got 'z-'; write body.nodes\('z-'\)"),
     "nodes": (on(lambda b, s, f: (s.nodes("z-"), f)), r"add_contact: expected the body or a surface.*got nodes"),
     "empty": (on(lambda b, s, f: (s.surface(lambda X: X[:, 0] > 9), f)), r"selection .* on body 'block' is empty"),
     "inner face": (on(inner_face), r"add_contact: the surface of body 'block': face .* is no outer face"),

@@ -207,6 +207,8 @@ def test_halved_steps_keep_momentum_and_energy(device, max_newton):
     energies = sim.energies()
     assert abs(energies["ledger_residual"][0]) <= 1e-9 * energies["kinetic"][0]
     assert record.friction.sum() == pytest.approx(energies["friction"][0], rel=1e-12)
+    speed = np.linalg.norm(begin[:2]) / model.mass  # m/s, which friction lowers
+    assert 0.7 < record.slip.max() / (4e-3 * speed) < 1.0  # also where the area shrinks between halves
 
 
 # history

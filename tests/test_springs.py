@@ -353,7 +353,7 @@ def test_bad_input_is_named():
         (lambda: b.add_spring(point, CENTRE, stiffness=1.0), "coincide"),
         (lambda: b.add_spring((0, 0, 0), (1, 0, 0), stiffness=1.0), "neither of its points"),
         (lambda: b.add_spring(wf.GROUND, point, stiffness=1.0), "give a point"),
-        (lambda: b.add_spring((0, 0, 0), point), "either stiffness or law"),
+        (lambda: b.add_spring((0, 0, 0), point), r"either stiffness or law \(a damper alone has stiffness=0\)"),
         (lambda: b.add_spring((0, 0, 0), point, stiffness=-1.0), "stiffness = -1.0"),
         (lambda: b.add_spring((0, 0, 0), point, stiffness=1.0, rest=-1.0), "rest = -1.0"),
         (lambda: b.add_spring((0, 0, 0), point, law=([1, 0], [0, 1])), "lengths rising"),

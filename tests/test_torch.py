@@ -66,6 +66,13 @@ def test_one_rollout(sim):
     early = (wf.torch.rollout(sim, {"motor": motor})["tip"].position ** 2).sum()
     wf.torch.rollout(sim, {"motor": 2.0 * motor})
     assert torch.equal(torch.autograd.grad(early, motor)[0], motor.grad)
+    given = {"motor": motor}, {"a.E": 1e6}
+    early = (wf.torch.rollout(sim, *given)["tip"].position ** 2).sum()
+    (undisturbed,) = torch.autograd.grad(early, motor, retain_graph=True)
+    wf.torch.rollout(sim, {"motor": motor.detach()}, {"a.E": 2e6})  # without derivatives
+    assert torch.equal(torch.autograd.grad(early, motor)[0], undisturbed)
+    with pytest.raises(wf.ModelError, match="give steps= for 'motor'"):
+        wf.torch.rollout(sim, {"motor": torch.zeros(3)})
     with pytest.raises(wf.ModelError, match="not clear"):
         wf.torch.rollout(sim)
     with pytest.raises(wf.ModelError, match=r"'motor': \(4, 3, 1\)"):

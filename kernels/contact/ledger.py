@@ -266,7 +266,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
     def total_records(
         clock: Clock, accepted: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=f64), scr: ContactScratch
     ):  # fmt: skip
-        """Record of the step so far: forces averaged over time, work summed."""
+        """Record of the step so far: forces averaged over time, work and mean slip summed."""
         world, c, j = wp.tid()
         h = clock.h[world]
         past = scr.elapsed_time[world]
@@ -276,6 +276,11 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
                 total = wp.max(total, parts[world, c, j, lane])
             else:
                 total += parts[world, c, j, lane]
+        if j == SLIP_ROW:
+            area = f64(0.0)
+            for lane in range(RECORD_LANES):
+                area += parts[world, c, AREA_ROW, lane]
+            total /= wp.max(area, f64(1.0e-300))
         old = scr.record_totals[world, c, j]
         if past == f64(0.0):
             old = f64(0.0)
@@ -304,12 +309,12 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
 
     @wp.kernel(module=module)
     def write_records(scr: ContactScratch, first: int, report: wp.array2d(dtype=f64)):
-        """Record of each contact for the report of the step; slip and stick as averages over the area in contact."""
+        """Record of each contact for the report of the step; stick as the average over the area in contact."""
         world, c = wp.tid()
         area = scr.record_totals[world, c, AREA_ROW]
         for j in range(SUMMED_ROWS + 1):
             value = scr.record_totals[world, c, j]
-            if j == SLIP_ROW or j == STICK_ROW:
+            if j == STICK_ROW:
                 value = value / wp.max(area, f64(1.0e-300))
             report[world, first + (SUMMED_ROWS + 1) * c + j] = value
 

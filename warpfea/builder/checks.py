@@ -56,6 +56,8 @@ def body_of_handle(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[
     wanted = " or ".join(HANDLE_NAMES[kind] for kind in kinds)
     if not isinstance(body, Body):
         hint = f"; write body.nodes({thing!r}) or body.surface({thing!r})" if isinstance(thing, str) else ""
+        if isinstance(thing, str) and thing in [body.name for body in bodies]:
+            hint = "; the handle of this body is what add_solid, add_beam, add_shell or add_rigid returned"
         raise ModelError(f"{what}: expected a handle of a body, {wanted}, got {thing!r}{hint}")
     if not isinstance(thing, kinds):
         raise ModelError(

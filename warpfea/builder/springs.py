@@ -219,7 +219,7 @@ class SpringMethods:
     ) -> dict[str, Any]:  # fmt: skip
         """Checked values of a Spring."""
         if (stiffness is None) == (law is None):
-            raise ModelError(f"{what}: give either stiffness or law")
+            raise ModelError(f"{what}: give either stiffness or law (a damper alone has stiffness=0)")
         if law is not None and rest not in (None, default_rest):
             raise ModelError(f"{what}: its law gives the force at every length; it has no rest")
         if isinstance(law, (tuple, list)) and len(law) == 2:

@@ -83,7 +83,7 @@ def check_constraint_tol(value: Any) -> None:
 def check_state(model: Model, state: State) -> None:
     """Raise ModelError unless `state` is a state of this model."""
     if not isinstance(state, State):
-        raise ModelError(f"expected a State, got {type(state).__name__}; model.state() makes one")
+        raise ModelError(f"expected a State, got {type(state).__name__}; sim.state is one, model.state() makes one")
     got, expected = state.displacement, (model.worlds, model.slots)
     if got.shape != expected or got.dtype != model.types.vec3 or got.device != model.device:
         raise ModelError(

@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from ..base.errors import ModelError
+from ..base.names import listing
 from ..model.state import State
 from .adjoint import INITIAL, Adjoint
 from .simulation import Simulation
@@ -56,6 +57,8 @@ def rollout(
     start: dict[str, Any] = {} if state is None or isinstance(state, State) else dict(zip(INITIAL, state))
     place = {"dtype": torch.float64, "device": wp.device_to_torch(m.device)}
     given = {name: torch.as_tensor(value, **place) for name, value in {**controls, **parameters, **start}.items()}
+    if steps is None and (flat := [name for name in controls if given[name].ndim < 2]):
+        raise ModelError(f"rollout: controls are ([worlds,] steps, size); give steps= for {listing(flat)}")
     lengths = {given[name].shape[-2] for name in controls} if steps is None else {steps}
     if len(lengths) != 1:
         raise ModelError(f"rollout: the number of steps is not clear from the controls: {sorted(lengths)}; give steps=")
@@ -67,7 +70,7 @@ def rollout(
         tensors = [torch.broadcast_to(given[name], shape) for name, shape in shapes.items()]
     except RuntimeError as error:
         raise ModelError(f"rollout: takes {shapes}, got { {n: tuple(t.shape) for n, t in given.items()} }") from error
-    names = [name for name, tensor in zip(shapes, tensors) if tensor.requires_grad]
+    names = [name for name, tensor in zip(shapes, tensors) if tensor.requires_grad] or [INITIAL[1]]
     tapes = vars(sim).setdefault("rollout_tapes", {})  # the kernels of a tape are loaded, its steps recorded once
     tape = tapes.get((*names, tol)) or tapes.setdefault((*names, tol), Adjoint(sim, names, tol=tol))
 
@@ -81,6 +84,7 @@ def rollout(
             for name in controls:
                 sim.controls[name].assign(values[name][:, k])
             tape.run(1)
+        vars(sim)["rollout_latest"] = tape.kept
 
     probes = [probe.name for probe in m.description.probes]
     out = _function().apply(tape, run, list(shapes), names, probes, *tensors)
@@ -126,7 +130,7 @@ def _function() -> Any:
         @torch.autograd.function.once_differentiable
         def backward(ctx, *bars):
             tape, run, given, names, probes = ctx.more
-            if tape.kept is not ctx.kept:
+            if vars(tape.sim)["rollout_latest"] is not ctx.kept:  # another may have set parameters
                 run(given, ctx.saved_tensors)
             for array, bar in zip((array for name in probes for array in tape.probe(name).arrays), bars):
                 wp.to_torch(array.grad).copy_(bar)
