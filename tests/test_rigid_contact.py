@@ -173,3 +173,17 @@ def test_a_drive_in_steps_that_impacts_set_to_backward_euler():
     sim.step(6)
     assert sim.joint_value(hinge)[0] == pytest.approx(0.018, rel=1e-5)
     assert sim.energies()["integrator"][0] > 10.0
+
+
+def test_impacts_that_backward_euler_does_not_solve_stay_those_of_the_scheme():
+    """Boxes that tumble onto the floor with friction: their steps were refused at once."""
+    b = wf.ModelBuilder()
+    for k in range(2):
+        box = b.add_rigid(wf.Box((0.3 * k, 0, 0.0505 + 0.02 * k), (0.1, 0.1, 0.1)), mass=1.0)
+        b.add_contact(box, b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.3)
+        b.set_initial(box, velocity=(0, 0, -1), angular_velocity=(5 * k, 3, 0))
+    wheel = b.add_rigid(wf.Cylinder((0, 4, 1), (0, 4.1, 1), 0.2), mass=1.0)
+    b.add_joint("revolute", parent=wf.GROUND, child=wheel.at((0, 4, 1)), axis=(0, 1, 0))
+    b.set_initial(wheel, angular_velocity=(0, 3.0, 0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=5e-3, integrator="energy_momentum")
+    sim.step(10)

@@ -9,6 +9,7 @@ from .types import int_1d, precision
 
 __all__ = [
     "IMPACT_FOUND",
+    "IMPACT_IGNORED",
     "IMPACT_REPEATED",
     "RESTART_FOUND",
     "RESTART_REPEATED",
@@ -21,6 +22,8 @@ __all__ = [
 RESTART_FOUND, IMPACT_FOUND, RESTART_REPEATED, IMPACT_REPEATED = 1, 2, 3, 4
 """Values of `impact` of the step control: what the scheme remembers of the step before does not fit the forces of the
 attempt, or it does not resolve an impact; for the larger one that is found it is taken again, by backward Euler."""
+IMPACT_IGNORED = -1
+"""That attempt failed: it is as the scheme takes it."""
 
 
 @functools.cache

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.structs import IMPACT_FOUND
+from ..common.structs import IMPACT_FOUND, IMPACT_IGNORED
 from ..common.types import f64, vec3d
 from .assembly import contact_module
 from .friction import friction_functions
@@ -174,7 +174,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
     ):  # fmt: skip
         """Flag worlds whose converged attempt stops a point within the substep; `only_plastic`: of restitution 0."""
         world, item = wp.tid()
-        seen = impact[world] >= IMPACT_FOUND
+        seen = impact[world] >= IMPACT_FOUND or impact[world] == IMPACT_IGNORED
         if running[world] == 0 or failed[world] != 0 or seen:
             return
         c = facets.contact[item]

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, RESTART_REPEATED, free_components_function
+from ..common.structs import IMPACT_FOUND, IMPACT_IGNORED, IMPACT_REPEATED, RESTART_REPEATED, free_components_function
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_2d, f64, int_1d, precision
 from ..solvers.newton_control import Failure, control_struct
@@ -227,7 +227,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         """Accept the substep, or refuse and halve it, or take it again with backward Euler.
 
         Multistep schemes and averages of accelerations keep part of the force of an impact for the next steps, and
-        throw a body back that the step has stopped, with more momentum than the forces of the report give it.
+        throw a body back that the step has stopped, with more momentum than the forces of the report give it. A
+        mid-point scheme takes its own attempt where that with backward Euler fails.
         """
         world = wp.tid()
         if wp.static(impacts):
@@ -236,6 +237,11 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
                 step.impact[world] = step.impact[world] + (IMPACT_REPEATED - IMPACT_FOUND)
                 wp.atomic_max(step.any_running, 0, 1)
                 return
+            if wp.static(midpoint):
+                if step.impact[world] == IMPACT_REPEATED and newton.failed[world] != 0:
+                    step.impact[world] = IMPACT_IGNORED
+                    wp.atomic_max(step.any_running, 0, 1)
+                    return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
             newton.failed[world] = Failure.ELEMENT_INVERTED
         if newton.failed[world] == 0:
