@@ -222,6 +222,19 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             new = (T(1.0) / T(step.dq_dv[world])) * (u_n[world, slot] - q_tilde[world, slot])
         v[world, slot] = free_components(free[slot], new, v[world, slot])
 
+    @wp.func
+    def is_taken_again(step: Step, newton: Newton, world: int) -> bool:
+        """True if an impact was found, or backward Euler failed for it; sets how the attempt is taken next."""
+        impact = step.impact[world]
+        if impact > 0 and impact <= IMPACT_FOUND and newton.failed[world] == 0 and newton.inverted[world] == 0:
+            step.impact[world] = impact + (IMPACT_REPEATED - IMPACT_FOUND)
+            return True
+        if wp.static(midpoint):
+            if impact == IMPACT_REPEATED and newton.failed[world] != 0:
+                step.impact[world] = IMPACT_IGNORED
+                return True
+        return False
+
     @masked_kernel(module, "step.running")
     def end_attempt(step: Step, newton: Newton):
         """Accept the substep, or refuse and halve it, or take it again with backward Euler.
@@ -232,16 +245,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         """
         world = wp.tid()
         if wp.static(impacts):
-            found = step.impact[world] > 0 and step.impact[world] <= IMPACT_FOUND
-            if found and newton.failed[world] == 0 and newton.inverted[world] == 0:
-                step.impact[world] = step.impact[world] + (IMPACT_REPEATED - IMPACT_FOUND)
+            if is_taken_again(step, newton, world):
                 wp.atomic_max(step.any_running, 0, 1)
                 return
-            if wp.static(midpoint):
-                if step.impact[world] == IMPACT_REPEATED and newton.failed[world] != 0:
-                    step.impact[world] = IMPACT_IGNORED
-                    wp.atomic_max(step.any_running, 0, 1)
-                    return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
             newton.failed[world] = Failure.ELEMENT_INVERTED
         if newton.failed[world] == 0:
