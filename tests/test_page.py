@@ -244,16 +244,21 @@ def test_page_of_a_usd_file(tmp_path, browser):
     assert np.abs(np.reshape(got, (-1, 3)) - wanted).max() < 1e-4
     assert tab("document.documentElement.scrollWidth") <= 390  # a phone needs no scrolling sideways
     # no point of any frame is under the bar of colours
-    reach = tab("""(() => { const v = page.view, out = [];
+    reach_of = """(() => { const v = page.view, out = [];
       for (let k = 0; k < page.data.times.length; k++) for (const s of v.surfaces) {
         s.move(k, 0, 1);
         for (let p = 0; p < s.count; p++)
           out.push(v.camera.project(Array.from(s.points.subarray(3 * p, 3 * p + 3)), v.aspect())[0]);
-      } return [Math.min(...out), Math.max(...out)]; })()""")
-    bar = tab("""(() => { const box = (id) => document.getElementById(id).getBoundingClientRect();
-      return (box("legend").left - box("picture").left) / box("picture").width * 2 - 1; })()""")
+      } return [Math.min(...out), Math.max(...out)]; })()"""
+    reach, bar_of = tab(reach_of), """(() => { const box = (id) => document.getElementById(id).getBoundingClientRect();
+      return (box("legend").left - box("picture").left) / box("picture").width * 2 - 1; })()"""
     assert -1.0 < reach[0] < -0.6
-    assert bar - 0.3 < reach[1] < bar
+    assert tab(bar_of) - 0.3 < reach[1] < tab(bar_of)
+    tab.page.set_viewport_size({"width": 300, "height": 760})  # as a narrower window
+    tab.page.wait_for_timeout(300)
+    reach = tab(reach_of)
+    assert -1.0 < reach[0] < -0.6
+    assert reach[1] < tab(bar_of)
     dark = tab("getComputedStyle(document.body).backgroundColor")
     assert max(map(int, dark[4:-1].split(","))) < 60
 

@@ -158,6 +158,29 @@ class Camera {
     }
     this.distance = distance;
   }
+
+  look() { return [this.azimuth, this.elevation, this.distance, ...this.target].join(); }
+}
+
+// points of the bodies among surfaces over the whole motion, and of colliders near them; the box of the bodies
+function outline(surfaces, scale) {
+  const bodies = surfaces.filter((s) => s.kind === "body"), points = [];
+  const total = bodies.reduce((n, s) => n + s.count * s.frames, 0), stride = Math.max(1, Math.floor(total / 8000));
+  for (const s of bodies)
+    for (let k = 0; k < s.frames; k++) {
+      s.move(k, 0, scale);
+      for (let i = k % stride; i < s.count; i += stride) points.push(Array.from(s.points.subarray(3 * i, 3 * i + 3)));
+    }
+  const low = [0, 1, 2].map((c) => points.reduce((m, p) => Math.min(m, p[c]), Infinity));
+  const high = [0, 1, 2].map((c) => points.reduce((m, p) => Math.max(m, p[c]), -Infinity));
+  const wide = 0.15 * Math.hypot(...sum(high, low, -1));
+  for (const s of surfaces.filter((other) => other.kind === "collider"))
+    for (const k of [0, s.frames - 1]) {
+      s.move(k, 0, 1);
+      for (let i = 0; i < s.count; i += 4)
+        points.push([0, 1, 2].map((c) => clamp(s.points[3 * i + c], low[c] - wide, high[c] + wide)));
+    }
+  return { points, box: [low, high] };
 }
 
 const SURFACE_VERTEX = `#version 300 es

@@ -91,7 +91,7 @@ class View {
     $("auto").onclick = () => { this.setField(this.field?.index ?? -1); this.draw(); };
     $("fit").onclick = () => { this.fit(); this.draw(); };
     $("play").onclick = () => (this.playing ? this.pause() : this.play());
-    new ResizeObserver(() => { this.resize(); this.draw(); }).observe($("stage"));
+    new ResizeObserver(() => { this.resize(); if (this.camera.look() === this.fitted) this.frame(); this.draw(); }).observe($("stage"));
     DARK.addEventListener("change", () => { this.draw(); this.plot?.(); });
     document.addEventListener("keydown", (event) => this.key(event));
     this.bindPointer($("picture"));
@@ -168,26 +168,17 @@ class View {
 
   // shows the whole motion
   fit() {
-    const bodies = this.shown().filter((s) => s.kind === "body"), points = [];
-    const total = bodies.reduce((n, s) => n + s.count * s.frames, 0), stride = Math.max(1, Math.floor(total / 8000));
-    for (const s of bodies)
-      for (let k = 0; k < s.frames; k++) {
-        s.move(k, 0, this.scale);
-        for (let i = k % stride; i < s.count; i += stride) points.push(Array.from(s.points.subarray(3 * i, 3 * i + 3)));
-      }
-    const low = [0, 1, 2].map((c) => points.reduce((m, p) => Math.min(m, p[c]), Infinity));
-    const high = [0, 1, 2].map((c) => points.reduce((m, p) => Math.max(m, p[c]), -Infinity));
-    const wide = 0.15 * Math.hypot(...sum(high, low, -1));
-    for (const s of this.shown().filter((other) => other.kind === "collider"))
-      for (const k of [0, s.frames - 1]) {
-        s.move(k, 0, 1);
-        for (let i = 0; i < s.count; i += 4)
-          points.push([0, 1, 2].map((c) => clamp(s.points[3 * i + c], low[c] - wide, high[c] + wide)));
-      }
-    this.box = [low, high];
+    this.outline = outline(this.shown(), this.scale);
+    this.box = this.outline.box;
+    this.frame();
+  }
+
+  // shows the outline of the last `fit`; again in a window of another shape, until the camera is moved
+  frame() {
     const bar = this.field ? ($("legend").offsetWidth + 20) / $("stage").clientWidth : 0.07; // beside the colour bar
     this.camera.center = [0.07 - bar, 0];
-    this.camera.fit(points, this.aspect(), [0.93 - bar, 0.86]);
+    this.camera.fit(this.outline.points, this.aspect(), [0.93 - bar, 0.86]);
+    this.fitted = this.camera.look();
   }
 
   aspect() { return $("picture").width / $("picture").height; }
