@@ -250,7 +250,8 @@ def test_page_of_a_usd_file(tmp_path, browser):
         for (let p = 0; p < s.count; p++)
           out.push(v.camera.project(Array.from(s.points.subarray(3 * p, 3 * p + 3)), v.aspect())[0]);
       } return [Math.min(...out), Math.max(...out)]; })()"""
-    reach, bar_of = tab(reach_of), """(() => { const box = (id) => document.getElementById(id).getBoundingClientRect();
+    reach = tab(reach_of)
+    bar_of = """(() => { const box = (id) => document.getElementById(id).getBoundingClientRect();
       return (box("legend").left - box("picture").left) / box("picture").width * 2 - 1; })()"""
     assert -1.0 < reach[0] < -0.6
     assert tab(bar_of) - 0.3 < reach[1] < tab(bar_of)
