@@ -12,22 +12,18 @@ import warpfea as wf
 from warpfea.solvers.choice import choose_adjoint_operator, choose_solver
 
 MAX_RATIO = {"pendulum": 1.0, "finger": 1.0, "gripper": 2.5}  # that of contact is not symmetric
-FILES = [
-    ("cpu", 1),
-    pytest.param("h200", 4096, marks=pytest.mark.xfail(strict=True, reason="1.08 and 1.07 on an H200")),
-]
 
 
-@pytest.mark.parametrize(("device", "worlds"), FILES)
+@pytest.mark.parametrize(("device", "worlds"), [("cpu", 1), ("h200", 4096), ("h100", 4096)])
 def test_a_step_back_costs_no_more_than_one_forward(device, worlds):
     content = content_of(f"gradient_cost_{device}.json", "python tests/gradient_cost.py")
     rows = {row["label"]: row for row in content["rows"]}
-    assert set(rows) == set(MAX_RATIO)
+    assert set(rows) == set(MAX_RATIO) - ({"gripper"} if device == "h100" else set())
+    assert device == "cpu" or content["machine"]["gpu"].startswith(f"NVIDIA {device.upper()}")
     for name, row in rows.items():
         assert row["worlds"] == worlds
         assert row["ratio"] <= MAX_RATIO[name], name
         assert row["recomputed"] == 0
-        assert row["setup_s"] < 60.0
 
 
 def test_gradients_beside_other_software():
