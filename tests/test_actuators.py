@@ -384,6 +384,7 @@ def test_forces_products_and_energies_agree(scheme: str) -> None:
         ctx.state.displacement.assign(rng.normal(scale=3e-2, size=shape))
         w.q_tilde.assign(ctx.state.displacement.numpy())
         w.step.dq_dv.fill_(5e-3 if scheme == "energy_momentum" else 1e-2)
+        w.step.h.fill_(1e-2)
         w.step.a0.fill_(1.0)
         active = wp.ones(1, dtype=wp.int32, device="cpu")
         w.time_law_stage_values.assign(rng.normal(scale=0.2, size=w.time_law_stage_values.numpy().shape))
