@@ -222,7 +222,7 @@ def falling():
 
 @pytest.mark.slow
 def test_free_fall_with_steps_of_their_own_sizes():
-    adaptive = wf.Simulation(falling(), dt="auto", error=1e-3, interval=4e-3, solver=SOLVER)
+    adaptive = wf.Simulation(falling(), dt="auto", error=1e-4, interval=4e-3, solver=SOLVER)
     parts = wf.Adjoint(adaptive, ["gravity"])
     parts.run(3)
     h = np.array([part["dt"].numpy()[0] for part in parts.kept[:-1]])

@@ -191,7 +191,7 @@ slow = "{MODELS}:slow_fall"
 [run]
 device = "cpu"
 [engine]
-worlds = 8
+worlds = 4
 """
 
 
@@ -297,8 +297,7 @@ def test_the_page_of_sweeps_runs(tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_leaves_a_record_that_goes_on(tmp_path):
     """The terminal interrupts driver and workers together: exit code 130, one line, no traceback."""
-    small = KILLED.replace("count = 200", "count = 40").replace("worlds = 8", "worlds = 4")  # most are left then
-    (tmp_path / "study.toml").write_text(small)
+    (tmp_path / "study.toml").write_text(KILLED.replace("count = 200", "count = 40"))  # most are left then
     words = [sys.executable, "-m", "warpfea", "sweep", str(tmp_path / "study.toml"), "--resume", "--workers", "2"]
     env, folder = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, tmp_path / "sweep"
     how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": env, "start_new_session": True}
